@@ -1,0 +1,69 @@
+"""SM2, SM3 and SM4, the Chinese commercial algorithms, in pure Python.
+
+`sm2` signature, key exchange, encryption (GB/T 32918) · `sm3` hash
+(GB/T 32905) · `sm4` block cipher, modes, AEAD (GB/T 32907, 17964) · `kdf` key
+derivation · `x509` certificates. Importing the package loads none of them:
+each arrives with its first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from smcrypto.errors import (
+    AlreadyFinalized,
+    CertificateError,
+    ConfirmationError,
+    InvalidCiphertext,
+    InvalidEncoding,
+    InvalidKey,
+    InvalidLength,
+    InvalidOption,
+    InvalidPadding,
+    InvalidSignature,
+    InvalidTag,
+    MissingDependency,
+    OutOfOrder,
+    SMCryptoError,
+)
+
+if TYPE_CHECKING:
+    from smcrypto import kdf, sm2, sm3, sm4, x509
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AlreadyFinalized",
+    "CertificateError",
+    "ConfirmationError",
+    "InvalidCiphertext",
+    "InvalidEncoding",
+    "InvalidKey",
+    "InvalidLength",
+    "InvalidOption",
+    "InvalidPadding",
+    "InvalidSignature",
+    "InvalidTag",
+    "MissingDependency",
+    "OutOfOrder",
+    "SMCryptoError",
+    "kdf",
+    "sm2",
+    "sm3",
+    "sm4",
+    "x509",
+]
+
+_MODULES = frozenset({"kdf", "sm2", "sm3", "sm4", "x509"})
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name in _MODULES:
+        return import_module(f"smcrypto.{name}")
+    raise AttributeError(f"module 'smcrypto' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

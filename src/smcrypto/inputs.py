@@ -1,0 +1,30 @@
+"""What every public function does first: take any bytes-like object, refuse all else."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from smcrypto.errors import InvalidLength
+
+# collections.abc.Buffer exists from Python 3.12; at run time any object with the buffer protocol is taken.
+BytesLike: TypeAlias = bytes | bytearray | memoryview
+
+__all__ = ["BytesLike", "as_bytes", "as_exact_bytes"]
+
+
+def as_bytes(value: BytesLike, name: str) -> bytes:
+    """`value` as bytes, copied unless it is bytes already; TypeError names the argument."""
+    if type(value) is bytes:
+        return value
+    try:
+        return memoryview(value).tobytes()
+    except TypeError:
+        raise TypeError(f"{name} must be bytes-like, not {type(value).__name__}") from None
+
+
+def as_exact_bytes(value: BytesLike, name: str, length: int) -> bytes:
+    """As `as_bytes`, and InvalidLength unless it is exactly `length` bytes."""
+    data = as_bytes(value, name)
+    if len(data) != length:
+        raise InvalidLength(f"{name} must be {length} bytes, not {len(data)}")
+    return data
