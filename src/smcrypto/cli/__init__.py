@@ -1,0 +1,57 @@
+"""`python -m smcrypto`: hashing, keys, signatures, encryption and certificates from the command line.
+
+Built on argparse alone. Data goes to stdout or `-o`, talk and progress to
+stderr. Exit codes: 0 done, 1 refused (a signature that does not hold, a
+wrong password, an unreadable file), 2 a command line that makes no sense.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from smcrypto import __version__
+from smcrypto.cli import ca, digest, encryption, keys, signature
+from smcrypto.errors import SMCryptoError
+
+__all__ = ["build_parser", "main"]
+
+EXAMPLES = """\
+examples:
+  python -m smcrypto hash firmware.bin
+  python -m smcrypto keygen -o key.pem --public pub.pem
+  python -m smcrypto sign --key key.pem -o message.sig message.txt
+  python -m smcrypto verify --public pub.pem --signature message.sig message.txt
+  python -m smcrypto encrypt --to pub.pem -o message.sm2 message.txt
+  python -m smcrypto decrypt --key key.pem message.sm2
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m smcrypto",
+        description="SM2, SM3 and SM4 on files and pipes; '-' or no file is stdin.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"smcrypto {__version__}")
+    subparsers = parser.add_subparsers(required=True, metavar="command")
+    for module in (digest, keys, signature, encryption, ca):
+        module.add_parser(subparsers)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; every failure the user can act on is one line on stderr, never a traceback."""
+    options = build_parser().parse_args(arguments)
+    try:
+        code: int = options.run(options)
+    except (SMCryptoError, OSError) as error:
+        name = getattr(error, "filename", None)
+        text = f"{name}: {error.strerror}" if isinstance(error, OSError) and name else str(error)
+        print(f"smcrypto: {text or type(error).__name__}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return code

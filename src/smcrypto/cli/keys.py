@@ -1,0 +1,69 @@
+"""`keygen` and `pubkey`: SM2 key files that openssl reads, and reading those it writes."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from smcrypto import sm2
+from smcrypto.cli import passwords
+from smcrypto.cli.files import add_output, write_output, write_private
+
+__all__ = ["add_key", "add_parser", "add_public", "load_private", "load_public"]
+
+_ENCRYPTED = b"ENCRYPTED PRIVATE KEY"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    keygen = subparsers.add_parser(
+        "keygen", help="make a key pair",
+        description="Make an SM2 key pair; the private key file is readable by its owner alone.")
+    keygen.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the private key (PEM)")
+    keygen.add_argument("--public", type=Path, metavar="FILE", help="write the public key (PEM) here too")
+    keygen.add_argument("--format", choices=("pkcs8", "sec1"), default="pkcs8")
+    keygen.add_argument("--encrypt", action="store_true", help="encrypt the private key under a password")
+    keygen.add_argument("--force", action="store_true", help="overwrite an existing private key")
+    passwords.add_arguments(keygen)
+    keygen.set_defaults(run=run_keygen)
+
+    pubkey = subparsers.add_parser("pubkey", help="the public key of a private key",
+                                   description="Print the public key (PEM) that belongs to a private key.")
+    add_key(pubkey)
+    add_output(pubkey)
+    pubkey.set_defaults(run=run_pubkey)
+
+
+def add_key(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="private key (PEM)")
+    passwords.add_arguments(parser)
+
+
+def add_public(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--public", type=Path, required=True, metavar="FILE", help="public key (PEM)")
+
+
+def load_private(options: argparse.Namespace) -> sm2.PrivateKey:
+    data = options.key.read_bytes()
+    password = None
+    if _ENCRYPTED in data:
+        password = passwords.read_password(options, f"Password for {options.key}")
+    return sm2.PrivateKey.from_pem(data, password=password)
+
+
+def load_public(path: Path) -> sm2.PublicKey:
+    return sm2.PublicKey.from_pem(path.read_bytes())
+
+
+def run_keygen(options: argparse.Namespace) -> int:
+    key = sm2.PrivateKey.generate()
+    wants_password = options.encrypt or options.password_file or options.password_env
+    password = passwords.read_password(options, "New password", confirm=True) if wants_password else None
+    write_private(options.output, key.to_pem(password=password, format=options.format), force=options.force)
+    if options.public is not None:
+        write_output(options.public, iter([key.public_key.to_pem()]))
+    return 0
+
+
+def run_pubkey(options: argparse.Namespace) -> int:
+    write_output(options.output, iter([load_private(options).public_key.to_pem()]))
+    return 0
