@@ -1,0 +1,499 @@
+"""DER, the one encoding of ASN.1 values that is unique: X.690 (2021), clauses 8, 10 and 11.
+
+One bounded reader stands under every parser of this library: signatures and
+ciphertexts, key files, certificates. It takes what DER allows and nothing of
+BER: definite lengths in the fewest bytes (10.1), integers in the fewest bytes
+(8.3.2), booleans 00 and FF (11.1), unused bits zero (11.2.1), sets in order
+(11.6). So a value that was read has one encoding only, the one that was read.
+
+Not here: tag numbers above 30, REAL and EMBEDDED PDV, which none of our
+structures use; they are refused. What a structure means is its parser's
+business; a parser ends with `finish()`, which refuses what is left over.
+Every refusal is InvalidEncoding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from functools import lru_cache
+from typing import Final
+
+from smcrypto.errors import InvalidEncoding
+from smcrypto.inputs import BytesLike, as_bytes
+
+__all__ = [
+    "BIT_STRING",
+    "BMP_STRING",
+    "BOOLEAN",
+    "ENUMERATED",
+    "GENERALIZED_TIME",
+    "IA5_STRING",
+    "INTEGER",
+    "NULL",
+    "NUMERIC_STRING",
+    "OCTET_STRING",
+    "OID",
+    "PRINTABLE_STRING",
+    "SEQUENCE",
+    "SET",
+    "T61_STRING",
+    "UNIVERSAL_STRING",
+    "UTC_TIME",
+    "UTF8_STRING",
+    "VISIBLE_STRING",
+    "Reader",
+    "bit_string",
+    "boolean",
+    "check",
+    "element",
+    "enumerated",
+    "explicit",
+    "generalized_time",
+    "implicit",
+    "integer",
+    "named_bits",
+    "null",
+    "octet_string",
+    "oid",
+    "sequence",
+    "set_of",
+    "time",
+    "utf8_string",
+]
+
+# Identifier octets, X.690 8.1.2 and X.680 table 1; SEQUENCE and SET with the constructed bit (0x20).
+BOOLEAN: Final = 0x01
+INTEGER: Final = 0x02
+BIT_STRING: Final = 0x03
+OCTET_STRING: Final = 0x04
+NULL: Final = 0x05
+OID: Final = 0x06
+ENUMERATED: Final = 0x0A
+UTF8_STRING: Final = 0x0C
+NUMERIC_STRING: Final = 0x12
+PRINTABLE_STRING: Final = 0x13
+T61_STRING: Final = 0x14
+IA5_STRING: Final = 0x16
+UTC_TIME: Final = 0x17
+GENERALIZED_TIME: Final = 0x18
+VISIBLE_STRING: Final = 0x1A
+UNIVERSAL_STRING: Final = 0x1C
+BMP_STRING: Final = 0x1E
+SEQUENCE: Final = 0x30
+SET: Final = 0x31
+
+_CONSTRUCTED: Final = 0x20
+_CONTEXT: Final = 0x80  # context-specific class, 8.1.2.2
+# A certificate nests about ten deep; this bounds what hostile input can make a reader of readers do.
+_MAX_DEPTH: Final = 32
+# Universal tags that DER encodes in primitive form only (8.2 to 8.8, 8.19, 10.2).
+_PRIMITIVE_ONLY: Final = frozenset(
+    {BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, NULL, OID, ENUMERATED, UTF8_STRING, NUMERIC_STRING,
+     PRINTABLE_STRING, T61_STRING, IA5_STRING, UTC_TIME, GENERALIZED_TIME, VISIBLE_STRING, UNIVERSAL_STRING,
+     BMP_STRING}
+)  # fmt: skip
+# The longest object identifier we read, in bytes of content; the longest in use have about twenty.
+_MAX_OID: Final = 64
+
+
+class Reader:
+    """Reads one run of DER values front to back, never outside it.
+
+    A method that expects another type than the one that stands next raises
+    InvalidEncoding, as does anything that is not DER.
+    """
+
+    __slots__ = ("_data", "_depth", "_end", "_pos")
+
+    def __init__(self, data: BytesLike) -> None:
+        self._data = as_bytes(data, "data")
+        self._pos = 0
+        self._end = len(self._data)
+        self._depth = 0
+
+    # --- the one place where lengths are read ---
+
+    def _content(self, tag: int) -> tuple[int, int]:
+        """Step over the value that stands next, which must have `tag`; (start, end) of its content."""
+        data, pos, limit = self._data, self._pos, self._end
+        if pos + 2 > limit:
+            raise InvalidEncoding(f"expected tag {tag:#04x} at byte {pos}, found the end")
+        if data[pos] != tag:
+            raise InvalidEncoding(f"expected tag {tag:#04x} at byte {pos}, found {data[pos]:#04x}")
+        length = data[pos + 1]
+        start = pos + 2
+        if length >= 0x80:
+            # 8.1.3.5 long form; 8.1.3.6 (indefinite, 0x80) is not DER (10.1). Four bytes of length are 4 GiB.
+            count = length & 0x7F
+            if not 1 <= count <= 4 or start + count > limit:
+                raise InvalidEncoding(f"length at byte {pos + 1} is indefinite, too large or cut off")
+            length = int.from_bytes(data[start : start + count], "big")
+            if length < 0x80 or length >> (8 * (count - 1)) == 0:
+                raise InvalidEncoding(f"length at byte {pos + 1} is not in the fewest bytes")
+            start += count
+        end = start + length
+        if end > limit:
+            raise InvalidEncoding(f"value at byte {pos} runs {end - limit} bytes past its container")
+        self._pos = end
+        return start, end
+
+    def _inner(self, tag: int) -> Reader:
+        start, end = self._content(tag)
+        if self._depth >= _MAX_DEPTH:
+            raise InvalidEncoding(f"more than {_MAX_DEPTH} levels deep")
+        inner = Reader.__new__(Reader)
+        inner._data = self._data
+        inner._pos = start
+        inner._end = end
+        inner._depth = self._depth + 1
+        return inner
+
+    # --- position ---
+
+    def peek_tag(self) -> int | None:
+        """The identifier octet that stands next, None at the end."""
+        return self._data[self._pos] if self._pos < self._end else None
+
+    def at_end(self) -> bool:
+        return self._pos >= self._end
+
+    def finish(self) -> None:
+        """InvalidEncoding if anything is left."""
+        if self._pos != self._end:
+            raise InvalidEncoding(f"{self._end - self._pos} bytes left over at byte {self._pos}")
+
+    # --- values ---
+
+    def value(self, tag: int) -> bytes:
+        """The content of the next value, which must have exactly the identifier octet `tag`."""
+        start, end = self._content(tag)
+        return self._data[start:end]
+
+    def raw(self) -> bytes:
+        """The next value whole, identifier and length included; what is inside it is not looked at."""
+        begin = self._pos
+        if begin >= self._end:
+            raise InvalidEncoding(f"expected a value at byte {begin}, found the end")
+        tag = self._data[begin]
+        if tag & 0x1F == 0x1F or tag == 0:
+            raise InvalidEncoding(f"tag {tag:#04x} at byte {begin} is not used here")
+        _, end = self._content(tag)
+        return self._data[begin:end]
+
+    def checked(self) -> bytes:
+        """As `raw`, and everything inside is DER as well, as far as its tags tell (`check`)."""
+        begin = self._pos
+        self._walk()
+        return self._data[begin : self._pos]
+
+    def boolean(self) -> bool:
+        start, end = self._content(BOOLEAN)
+        if end - start != 1 or self._data[start] not in (0x00, 0xFF):
+            raise InvalidEncoding(f"boolean at byte {start} is neither 00 nor FF")
+        return self._data[start] == 0xFF
+
+    def integer(self, *, signed: bool = False) -> int:
+        """A whole number in the fewest bytes (8.3.2); a negative one only with `signed`."""
+        start, end = self._content(INTEGER)
+        return self._number(start, end, signed)
+
+    def enumerated(self) -> int:
+        start, end = self._content(ENUMERATED)
+        return self._number(start, end, False)
+
+    def implicit_integer(self, number: int) -> int:
+        """A non-negative INTEGER under the implicit tag [number]."""
+        start, end = self._content(_CONTEXT | number)
+        return self._number(start, end, False)
+
+    def _number(self, start: int, end: int, signed: bool) -> int:
+        data = self._data
+        if start == end:
+            raise InvalidEncoding(f"integer at byte {start} is empty")
+        first = data[start]
+        if end - start > 1 and (
+            (first == 0x00 and data[start + 1] < 0x80) or (first == 0xFF and data[start + 1] >= 0x80)
+        ):
+            raise InvalidEncoding(f"integer at byte {start} is not in the fewest bytes")
+        if first >= 0x80 and not signed:
+            raise InvalidEncoding(f"integer at byte {start} is negative")
+        return int.from_bytes(data[start:end], "big", signed=True)
+
+    def octet_string(self) -> bytes:
+        start, end = self._content(OCTET_STRING)
+        return self._data[start:end]
+
+    def bit_string(self) -> bytes:
+        """A bit string of whole bytes."""
+        start, end = self._content(BIT_STRING)
+        if start == end or self._data[start] != 0:
+            raise InvalidEncoding(f"bit string at byte {start} is not a whole number of bytes")
+        return self._data[start + 1 : end]
+
+    def named_bits(self) -> frozenset[int]:
+        """The numbers of the bits that are set in a NamedBitList; trailing zero bits are refused (11.2.2)."""
+        return _bits(self.value(BIT_STRING))
+
+    def implicit_named_bits(self, number: int) -> frozenset[int]:
+        return _bits(self.value(_CONTEXT | number))
+
+    def null(self) -> None:
+        start, end = self._content(NULL)
+        if start != end:
+            raise InvalidEncoding(f"null at byte {start} is not empty")
+
+    def oid(self) -> str:
+        """An object identifier in dotted form."""
+        start, end = self._content(OID)
+        return _dotted(self._data[start:end])
+
+    def sequence(self) -> Reader:
+        return self._inner(SEQUENCE)
+
+    def set_of(self) -> Reader:
+        """The elements of a SET OF, which must stand in ascending order of their encodings (11.6)."""
+        inner = self._inner(SET)
+        inner._require_order()
+        return inner
+
+    def implicit_set_of(self, number: int) -> Reader:
+        inner = self._inner(_CONTEXT | _CONSTRUCTED | number)
+        inner._require_order()
+        return inner
+
+    def explicit(self, number: int) -> Reader:
+        """What is inside the constructed tag [number]: an EXPLICIT value, or an IMPLICIT sequence."""
+        return self._inner(_CONTEXT | _CONSTRUCTED | number)
+
+    def implicit(self, number: int) -> bytes:
+        """The content under the primitive tag [number]."""
+        return self.value(_CONTEXT | number)
+
+    def has_explicit(self, number: int) -> bool:
+        return self.peek_tag() == _CONTEXT | _CONSTRUCTED | number
+
+    def has_implicit(self, number: int) -> bool:
+        return self.peek_tag() == _CONTEXT | number
+
+    def generalized_time(self) -> datetime:
+        return _parse_time(GENERALIZED_TIME, self.value(GENERALIZED_TIME))
+
+    def time(self) -> datetime:
+        """A Time of RFC 5280, 4.1.2.5: UTCTime for 1950-2049, else GeneralizedTime; UTC, whole seconds."""
+        tag = UTC_TIME if self.peek_tag() == UTC_TIME else GENERALIZED_TIME
+        moment = _parse_time(tag, self.value(tag))
+        if tag == GENERALIZED_TIME and 1950 <= moment.year <= 2049:
+            raise InvalidEncoding("a date through 2049 must be a UTCTime (RFC 5280, 4.1.2.5)")
+        return moment
+
+    # --- order and walk ---
+
+    def _require_order(self) -> None:
+        begin, previous = self._pos, b""
+        while self._pos < self._end:
+            current = self.raw()
+            if current < previous:
+                raise InvalidEncoding(f"set at byte {begin} is not in ascending order")
+            previous = current
+        self._pos = begin
+
+    def _walk(self) -> None:
+        tag = self.peek_tag()
+        if tag is None:
+            raise InvalidEncoding(f"expected a value at byte {self._pos}, found the end")
+        strange = tag < 0x40 and tag & _CONSTRUCTED and tag not in (SEQUENCE, SET)
+        if tag & 0x1F == 0x1F or tag == 0 or strange:
+            raise InvalidEncoding(f"tag {tag:#04x} at byte {self._pos} is not used here")
+        if tag & _CONSTRUCTED:
+            inner = self._inner(tag)
+            if tag == SET:
+                inner._require_order()
+            while inner._pos < inner._end:
+                inner._walk()
+        elif tag == BOOLEAN:
+            self.boolean()
+        elif tag in (INTEGER, ENUMERATED):
+            start, end = self._content(tag)
+            self._number(start, end, True)
+        elif tag == BIT_STRING:
+            _split_bits(self.value(BIT_STRING))
+        elif tag == NULL:
+            self.null()
+        elif tag == OID:
+            self.oid()
+        elif tag < 0x40 and tag not in _PRIMITIVE_ONLY:
+            raise InvalidEncoding(f"tag {tag:#04x} at byte {self._pos} is not used here")
+        else:
+            self._content(tag)
+
+
+def check(data: BytesLike) -> bytes:
+    """`data` again, if it is exactly one DER value and everything inside it is DER; else InvalidEncoding."""
+    reader = Reader(data)
+    value = reader.checked()
+    reader.finish()
+    return value
+
+
+def _split_bits(content: bytes) -> tuple[int, bytes]:
+    """(unused bits, bytes) of a bit string; the unused bits must be zero (11.2.1)."""
+    if not content or content[0] > 7 or (content[0] and len(content) == 1):
+        raise InvalidEncoding("bit string has an impossible number of unused bits")
+    if content[-1] & ((1 << content[0]) - 1) and len(content) > 1:
+        raise InvalidEncoding("bit string has unused bits that are not zero")
+    return content[0], content[1:]
+
+
+def _bits(content: bytes) -> frozenset[int]:
+    unused, body = _split_bits(content)
+    if body and not body[-1] & (1 << unused):
+        raise InvalidEncoding("named bits end in zero bits (X.690, 11.2.2)")
+    return frozenset(8 * i + j for i, byte in enumerate(body) for j in range(8) if byte & (0x80 >> j))
+
+
+@lru_cache(maxsize=512)
+def _dotted(content: bytes) -> str:
+    """8.19: base 128, each arc in the fewest bytes; the first two arcs share a number."""
+    if not content or content[-1] >= 0x80 or len(content) > _MAX_OID:
+        raise InvalidEncoding("object identifier is empty, cut off or too long")
+    arcs: list[int] = []
+    number, fresh = 0, True
+    for byte in content:
+        if fresh and byte == 0x80:
+            raise InvalidEncoding("object identifier has an arc that is not in the fewest bytes")
+        number = number << 7 | byte & 0x7F
+        fresh = byte < 0x80
+        if fresh:
+            arcs.append(number)
+            number = 0
+    first = min(arcs[0] // 40, 2)
+    return ".".join(map(str, [first, arcs[0] - 40 * first, *arcs[1:]]))
+
+
+def _parse_time(tag: int, content: bytes) -> datetime:
+    """YYMMDDHHMMSSZ or YYYYMMDDHHMMSSZ (11.7, 11.8; RFC 5280, 4.1.2.5.1 and .2: no fractions, no offsets)."""
+    digits = 12 if tag == UTC_TIME else 14
+    if len(content) != digits + 1 or content[-1:] != b"Z" or not content[:-1].isdigit():
+        raise InvalidEncoding("time is not of the form [YY]YYMMDDHHMMSSZ")
+    text = content[:-1].decode("ascii")
+    if tag == UTC_TIME:
+        text = ("19" if text >= "50" else "20") + text
+    year, rest = int(text[:4]), [int(text[i : i + 2]) for i in range(4, 14, 2)]
+    try:
+        return datetime(year, rest[0], rest[1], rest[2], rest[3], rest[4], tzinfo=UTC)
+    except ValueError:
+        raise InvalidEncoding(f"there is no time {text}Z") from None
+
+
+# --- writing ---
+
+
+def element(tag: int, content: bytes) -> bytes:
+    """One value: identifier octet, length in the fewest bytes, content."""
+    length = len(content)
+    if length < 0x80:
+        return bytes((tag, length)) + content
+    size = (length.bit_length() + 7) // 8
+    return bytes((tag, 0x80 | size)) + length.to_bytes(size, "big") + content
+
+
+def boolean(value: bool) -> bytes:
+    return b"\x01\x01\xff" if value else b"\x01\x01\x00"
+
+
+def _magnitude(number: int) -> bytes:
+    """Two's complement in the fewest bytes: n >= 0 needs bit_length + 1 bits, n < 0 as many as -n-1 does."""
+    bits = number.bit_length() if number >= 0 else (-number - 1).bit_length()
+    return number.to_bytes(bits // 8 + 1, "big", signed=True)
+
+
+def integer(number: int) -> bytes:
+    return element(INTEGER, _magnitude(number))
+
+
+def enumerated(number: int) -> bytes:
+    return element(ENUMERATED, _magnitude(number))
+
+
+def octet_string(content: bytes) -> bytes:
+    return element(OCTET_STRING, content)
+
+
+def bit_string(content: bytes) -> bytes:
+    """A bit string of whole bytes."""
+    return element(BIT_STRING, b"\x00" + content)
+
+
+def named_bits(bits: Iterable[int]) -> bytes:
+    """A NamedBitList with these bits set, without trailing zero bits (11.2.2)."""
+    wanted = set(bits)
+    if not wanted:
+        return element(BIT_STRING, b"\x00")
+    top = max(wanted)
+    unused = 7 - top % 8
+    number = sum(1 << (top - bit) for bit in wanted) << unused
+    return element(BIT_STRING, bytes((unused,)) + number.to_bytes(top // 8 + 1, "big"))
+
+
+def null() -> bytes:
+    return b"\x05\x00"
+
+
+@lru_cache(maxsize=512)
+def oid(dotted: str) -> bytes:
+    """The object identifier written as `1.2.156.10197`; InvalidEncoding if that is not one."""
+    parts = dotted.split(".")
+    if len(parts) < 2 or not all(part.isascii() and part.isdigit() and len(part) < 40 for part in parts):
+        raise InvalidEncoding(f"not an object identifier: {dotted!r}")
+    if any(part[0] == "0" and part != "0" for part in parts):
+        raise InvalidEncoding(f"not an object identifier: {dotted!r}")
+    first, second, *rest = map(int, parts)
+    if first > 2 or (first < 2 and second > 39):
+        raise InvalidEncoding(f"not an object identifier: {dotted!r}")
+    content = bytearray()
+    for arc in (40 * first + second, *rest):
+        groups = [arc & 0x7F]
+        while arc := arc >> 7:
+            groups.append(arc & 0x7F | 0x80)
+        content += bytes(reversed(groups))
+    if len(content) > _MAX_OID:
+        raise InvalidEncoding(f"object identifier longer than {_MAX_OID} bytes")
+    return element(OID, bytes(content))
+
+
+def sequence(*parts: bytes) -> bytes:
+    return element(SEQUENCE, b"".join(parts))
+
+
+def set_of(*parts: bytes) -> bytes:
+    """A SET OF, its elements put in order (11.6)."""
+    return element(SET, b"".join(sorted(parts)))
+
+
+def explicit(number: int, *parts: bytes) -> bytes:
+    """The constructed tag [number] around `parts`: an EXPLICIT value, or an IMPLICIT sequence."""
+    return element(_CONTEXT | _CONSTRUCTED | number, b"".join(parts))
+
+
+def implicit(number: int, content: bytes) -> bytes:
+    """The primitive tag [number] around `content`."""
+    return element(_CONTEXT | number, content)
+
+
+def utf8_string(text: str) -> bytes:
+    return element(UTF8_STRING, text.encode("utf-8"))
+
+
+def generalized_time(moment: datetime) -> bytes:
+    """`moment`, an aware datetime, in UTC and whole seconds (a fraction is cut off)."""
+    utc = moment.astimezone(UTC)
+    return element(GENERALIZED_TIME, f"{utc:%Y%m%d%H%M%SZ}".rjust(15, "0").encode("ascii"))
+
+
+def time(moment: datetime) -> bytes:
+    """A Time of RFC 5280, 4.1.2.5: UTCTime for the years 1950 to 2049, else GeneralizedTime."""
+    utc = moment.astimezone(UTC)
+    if 1950 <= utc.year <= 2049:
+        return element(UTC_TIME, f"{utc:%y%m%d%H%M%SZ}".encode("ascii"))
+    return generalized_time(utc)
