@@ -1,0 +1,52 @@
+"""Where passphrases come from: a file, the service manager's credentials folder, or a prompt. Never argv.
+
+systemd hands secrets to a service as files in $CREDENTIALS_DIRECTORY
+(systemd.exec(5), LoadCredential=); there the passphrase is called NAME.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from rosbridge_eth.errors import IdentityError
+
+
+def read_passphrase(
+    name: str, prompt: str, *, file: Path | None = None, confirm: bool = False,
+    environment: Mapping[str, str] = os.environ,
+) -> bytes:
+    """The passphrase called `name` ("operator", "robot", "reader"), without its line end.
+
+    Looked for in `file`, then as rosbridge-eth-NAME in the credentials folder, then asked for
+    (twice with `confirm`). IdentityError where there is none to be had.
+    """
+    folder = environment.get("CREDENTIALS_DIRECTORY")
+    credential = Path(folder, f"rosbridge-eth-{name}") if folder else None
+    if file is None and credential is not None and credential.exists():
+        file = credential
+    if file is not None:
+        return _from_file(file)
+    if not sys.stdin.isatty():
+        raise IdentityError(
+            f"the {name} passphrase is needed and there is no terminal to ask at: give --passphrase-file"
+        )
+    passphrase = getpass.getpass(f"{prompt}: ")
+    if confirm and getpass.getpass(f"{prompt} (again): ") != passphrase:
+        raise IdentityError("the two passphrases differ; nothing was written")
+    if not passphrase:
+        raise IdentityError("an empty passphrase protects nothing; choose another")
+    return passphrase.encode()
+
+
+def _from_file(file: Path) -> bytes:
+    try:
+        lines = file.read_bytes().splitlines()
+    except OSError as error:
+        raise IdentityError(f"cannot read the passphrase file {file}: {error.strerror}") from error
+    if not lines or not lines[0]:
+        raise IdentityError(f"the passphrase file {file} is empty; put the passphrase on its first line")
+    return lines[0]

@@ -1,0 +1,141 @@
+"""Who is enrolled: the operator's list of names, their certificates and accounts, and the server's allow list.
+
+One SQLite file in the operator's home. A name has at most one enrolment in
+force; enrolling it again needs `replace`, which revokes the one before. The
+server asks `allows` at every handshake and closes what is no longer allowed.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rosbridge_eth.errors import IdentityError, StoreError
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS enrolment (
+    number        INTEGER PRIMARY KEY,   -- order of enrolment; also the index of the account's derivation path
+    role          TEXT NOT NULL,         -- robot | server | reader
+    name          TEXT NOT NULL,
+    fingerprint   BLOB NOT NULL UNIQUE,  -- SM3 of the signing certificate, 32 bytes
+    certificates  BLOB NOT NULL,         -- signing and encryption certificate, PEM
+    account       TEXT,                  -- the robot's address on the chain
+    enrolled_at   TEXT NOT NULL,         -- UTC, ISO 8601
+    revoked_at    TEXT                   -- NULL while in force
+);
+CREATE UNIQUE INDEX IF NOT EXISTS in_force ON enrolment (role, name) WHERE revoked_at IS NULL;
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Enrolment:
+    """One identity the operator made: certificates in PEM, signing first; account for robots only."""
+
+    number: int
+    role: str
+    name: str
+    fingerprint: bytes
+    certificates: bytes
+    account: str | None
+    enrolled_at: datetime
+    revoked_at: datetime | None
+
+
+class Registry:
+    """The enrolments of one operator's home; safe to open from several processes."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._db = sqlite3.connect(path, timeout=10, isolation_level=None, check_same_thread=False)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(SCHEMA)
+        except sqlite3.Error as error:
+            raise StoreError(f"the registry {path} cannot be opened ({error}); restore it from a backup") from error
+
+    def close(self) -> None:
+        self._db.close()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+
+    def next_number(self) -> int:
+        """The number the next enrolment will get: never used before, so no account is ever shared."""
+        (highest,) = self._db.execute("SELECT coalesce(max(number), 0) FROM enrolment").fetchone()
+        return int(highest) + 1
+
+    def require_free(self, role: str, name: str) -> None:
+        """IdentityError where the name is in force."""
+        if self.find(role, name) is not None:
+            raise IdentityError(
+                f"{role} {name!r} is enrolled already; choose another name, or give --replace to revoke the old one"
+            )
+
+    def enrol(
+        self, *, number: int, role: str, name: str, fingerprint: bytes, certificates: bytes,
+        account: str | None, now: datetime, replace: bool = False,
+    ) -> Enrolment:
+        """Put an identity in force; with `replace` the one that held the name is revoked in the same write."""
+        with self._transaction():
+            if replace:
+                self._revoke(role, name, now)
+            else:
+                self.require_free(role, name)
+            self._db.execute(
+                "INSERT INTO enrolment VALUES (?, ?, ?, ?, ?, ?, ?, NULL)",
+                (number, role, name, fingerprint, certificates, account, now.isoformat()),
+            )
+        found = self.find(role, name)
+        if found is None:
+            raise StoreError(f"the registry lost {role} {name!r} as it was written; check the disk")
+        return found
+
+    def _revoke(self, role: str, name: str, now: datetime) -> int:
+        return self._db.execute(
+            "UPDATE enrolment SET revoked_at = ? WHERE role = ? AND name = ? AND revoked_at IS NULL",
+            (now.isoformat(), role, name),
+        ).rowcount
+
+    def revoke(self, role: str, name: str, now: datetime) -> None:
+        """Take a name out of force; IdentityError where it is not in force."""
+        if self._revoke(role, name, now) == 0:
+            raise IdentityError(f"no {role} {name!r} is enrolled; `status` lists the names")
+
+    def find(self, role: str, name: str) -> Enrolment | None:
+        """The enrolment in force under this name."""
+        rows = self._db.execute(
+            "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (role, name)
+        ).fetchall()
+        return _enrolment(rows[0]) if rows else None
+
+    def all(self, role: str | None = None) -> list[Enrolment]:
+        """Every enrolment there ever was, in order."""
+        rows = self._db.execute(
+            "SELECT * FROM enrolment WHERE ?1 IS NULL OR role = ?1 ORDER BY number", (role,)
+        ).fetchall()
+        return [_enrolment(row) for row in rows]
+
+    def allows(self, role: str, name: str, fingerprint: bytes) -> bool:
+        """Is this very certificate the one in force for the name?"""
+        found = self.find(role, name)
+        return found is not None and found.fingerprint == fingerprint
+
+
+def _enrolment(row: tuple[int, str, str, bytes, bytes, str | None, str, str | None]) -> Enrolment:
+    number, role, name, fingerprint, certificates, account, enrolled_at, revoked_at = row
+    return Enrolment(
+        number, role, name, fingerprint, certificates, account,
+        datetime.fromisoformat(enrolled_at).astimezone(UTC),
+        None if revoked_at is None else datetime.fromisoformat(revoked_at).astimezone(UTC),
+    )
