@@ -1,0 +1,121 @@
+"""SM2 key exchange with confirmation, GB/T 32918.3-2016.
+
+Names are the standard's: A the initiator, B the responder; d, P long-term, r, R
+ephemeral keys; x~ = 2^w + (x mod 2^w) with w = ceil(ceil(log2 n)/2) - 1; U = V the
+shared point; K the key; S_A, S_B the confirmations, S_B = S1 with 02, S_A = S2 with 03.
+"""
+
+from __future__ import annotations
+
+from hmac import compare_digest
+
+from smcrypto import sm3
+from smcrypto.errors import ConfirmationError, InvalidKey, InvalidLength, OutOfOrder
+from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.kdf import sm2_kdf
+from smcrypto.sm2.curve import Curve, Point, decode_point, encode_point
+from smcrypto.sm2.keys import PrivateKey, PublicKey
+from smcrypto.sm2.known_keys import comb_if_known, saw
+from smcrypto.sm2.points import secret_sum, to_affine
+from smcrypto.sm2.signature import z_value
+
+__all__ = ["KeyExchange"]
+
+
+def reduced_x(R: Point, curve: Curve) -> int:
+    """x~ of R, steps A4 and B3."""
+    w = -(-(curve.n - 1).bit_length() // 2) - 1
+    return 1 << w | R[0] & (1 << w) - 1
+
+
+def shared_point(curve: Curve, d: int, r: int, R: Point, peer_P: Point, peer_R: Point) -> Point | None:
+    """[h t](P' + [x~'] R') with t = d + x~ r: U for A (steps A5-A7), V for B (B4-B6); None if infinite.
+
+    Taken as [ht]P' + [ht x~']R': one run of doublings serves both, or none is needed
+    for P' where its comb is known.
+    """
+    ht = curve.h * (d + reduced_x(R, curve) * r) % curve.n
+    point = secret_sum(
+        curve, (ht, comb_if_known(curve, peer_P) or peer_P), (ht * reduced_x(peer_R, curve) % curve.n, peer_R)
+    )
+    return to_affine(point, curve)
+
+
+class KeyExchange:
+    """One party's side of one run; both sides then hold the same key, and know it once confirmed."""
+
+    __slots__ = ("_curve", "_ephemeral", "_ephemeral_key", "_expected", "_initiator", "_own", "_peer", "_z")
+
+    def __init__(
+        self,
+        own_key: PrivateKey,
+        own_uid: BytesLike,
+        peer_public: PublicKey,
+        peer_uid: BytesLike,
+        *,
+        initiator: bool,
+        ephemeral_key: PrivateKey | None = None,
+    ) -> None:
+        for key, kind, name in (
+            (own_key, PrivateKey, "own_key"),
+            (peer_public, PublicKey, "peer_public"),
+            (ephemeral_key or own_key, PrivateKey, "ephemeral_key"),
+        ):
+            if not isinstance(key, kind):
+                raise TypeError(f"{name} must be a {kind.__name__}, not {type(key).__name__}")
+        if not isinstance(initiator, bool):
+            raise TypeError(f"initiator must be a bool, not {type(initiator).__name__}")
+        self._curve = curve = own_key.curve
+        ephemeral_key = ephemeral_key or PrivateKey.generate(curve)
+        if peer_public.curve != curve or ephemeral_key.curve != curve:
+            raise InvalidKey("the keys are not of the same curve")
+        own_z = z_value(curve, own_key.public_key.point, as_bytes(own_uid, "own_uid"))
+        peer_z = z_value(curve, peer_public.point, as_bytes(peer_uid, "peer_uid"))
+        self._z = (own_z, peer_z) if initiator else (peer_z, own_z)
+        self._own = own_key
+        self._peer = peer_public
+        self._initiator = initiator
+        self._ephemeral_key: PrivateKey | None = ephemeral_key
+        self._ephemeral = ephemeral_key.public_key.point
+        self._expected: bytes | None = None
+
+    @property
+    def ephemeral(self) -> bytes:
+        """R, to be sent to the peer: 04 || x || y, 65 bytes."""
+        return encode_point(self._ephemeral, self._curve)
+
+    def agree(self, peer_ephemeral: BytesLike, length: int) -> tuple[bytes, bytes]:
+        """(key, confirmation to send)."""
+        data = as_bytes(peer_ephemeral, "peer_ephemeral")
+        if not isinstance(length, int) or isinstance(length, bool):
+            raise TypeError(f"length must be an int, not {type(length).__name__}")
+        if not 1 <= length < 32 * (2**32 - 1):
+            raise InvalidLength(f"length must be at least 1 byte and below 32 * (2**32 - 1), not {length}")
+        if self._ephemeral_key is None:
+            raise OutOfOrder("this exchange has agreed on a key already")
+        curve = self._curve
+        peer_R = decode_point(data, curve, allow_compressed=False)
+        peer_P = self._peer.point
+        V = shared_point(curve, self._own.to_int(), self._ephemeral_key.to_int(), self._ephemeral, peer_P, peer_R)
+        if V is None:
+            raise InvalidKey("the shared point is at infinity")
+        saw(curve, peer_P)
+        self._ephemeral_key = None
+        size = curve.field_bytes
+        x, y = V[0].to_bytes(size, "big"), V[1].to_bytes(size, "big")
+        z = b"".join(self._z)
+        key = sm2_kdf(x + y + z, length)
+        first, second = (self._ephemeral, peer_R) if self._initiator else (peer_R, self._ephemeral)
+        inner = sm3.digest(x + z + b"".join(v.to_bytes(size, "big") for v in (*first, *second)))
+        s_b, s_a = (sm3.digest(prefix + y + inner) for prefix in (b"\x02", b"\x03"))
+        own, self._expected = (s_a, s_b) if self._initiator else (s_b, s_a)
+        return key, own
+
+    def confirm(self, peer_confirmation: BytesLike) -> None:
+        """Return if the peer holds the same key; ConfirmationError otherwise."""
+        data = as_bytes(peer_confirmation, "peer_confirmation")
+        if self._expected is None:
+            raise OutOfOrder("confirm follows agree, once")
+        expected, self._expected = self._expected, None
+        if not compare_digest(expected, data):
+            raise ConfirmationError("the peer did not arrive at the same key")
