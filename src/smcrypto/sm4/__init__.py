@@ -1,0 +1,53 @@
+"""SM4, GB/T 32907-2016: the block cipher, its modes (GB/T 17964-2021), and authenticated encryption (RFC 8998).
+
+`SM4GCM` is what new designs want: it hides and protects. `encrypt`, `decrypt`
+and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
+already exist. `SM4` is the bare block.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smcrypto.sm4.block import SM4
+from smcrypto.sm4.modes import (
+    CBC,
+    CFB,
+    CTR,
+    ECB,
+    OFB,
+    XTS,
+    Cipher,
+    CipherStream,
+    decrypt,
+    encrypt,
+)
+
+if TYPE_CHECKING:
+    from smcrypto.sm4.aead import SM4CCM, SM4GCM
+
+__all__ = [
+    "CBC",
+    "CFB",
+    "CTR",
+    "ECB",
+    "OFB",
+    "SM4",
+    "SM4CCM",
+    "SM4GCM",
+    "XTS",
+    "Cipher",
+    "CipherStream",
+    "decrypt",
+    "encrypt",
+]
+
+
+def __getattr__(name: str) -> type:
+    """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD."""
+    if name in ("SM4CCM", "SM4GCM"):
+        from smcrypto.sm4 import aead
+
+        aead_class: type = getattr(aead, name)
+        return aead_class
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

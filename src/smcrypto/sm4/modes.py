@@ -1,0 +1,368 @@
+"""Modes of operation for SM4, GB/T 17964-2021: ECB, CBC, CFB, OFB, CTR, XTS.
+
+A mode is an immutable value; it says how, never what with. `Cipher` joins it
+with a key and opens streams; `encrypt` and `decrypt` do the whole in one call.
+CFB is the 128-bit one. XTS lives in its own file.
+
+Not here: modes that authenticate (aead). None of these detects a change;
+new designs want SM4GCM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias
+
+from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding
+from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
+from smcrypto.sm4.engine import Engine
+from smcrypto.sm4.xts import Variant, XTSStream, check_variant
+
+__all__ = ["CBC", "CFB", "CTR", "ECB", "OFB", "XTS", "Cipher", "CipherStream", "Mode", "Padding", "decrypt", "encrypt"]
+
+Padding: TypeAlias = Literal["pkcs7"] | None
+
+
+def _xor(a: bytes, b: bytes) -> bytes:
+    return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
+
+
+@dataclass(frozen=True, slots=True)
+class ECB:
+    """Electronic codebook: every block on its own, so equal blocks show. For key wrapping and tests, not messages."""
+
+
+@dataclass(frozen=True, slots=True)
+class CBC:
+    """Cipher block chaining. iv: 16 bytes, unpredictable and never used twice with one key; otherwise InvalidLength."""
+
+    iv: bytes
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+
+
+@dataclass(frozen=True, slots=True)
+class CFB:
+    """Cipher feedback over whole blocks (CFB-128).
+
+    iv: 16 bytes, never used twice with one key; otherwise InvalidLength.
+    """
+
+    iv: bytes
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+
+
+@dataclass(frozen=True, slots=True)
+class OFB:
+    """Output feedback. iv: 16 bytes, never used twice with one key; otherwise InvalidLength."""
+
+    iv: bytes
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+
+
+@dataclass(frozen=True, slots=True)
+class CTR:
+    """Counter mode. nonce: the first counter block, 16 bytes; otherwise InvalidLength.
+
+    The counter is the whole block, big-endian, and wraps from 2**128 - 1 to 0.
+    No two messages under one key may use the same counter value.
+    """
+
+    nonce: bytes
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nonce", as_exact_bytes(self.nonce, "nonce", 16))
+
+
+@dataclass(frozen=True, slots=True)
+class XTS:
+    """XTS for storage, with ciphertext stealing; takes a 32-byte key and data of at least 16 bytes.
+
+    tweak: 16 bytes, the number of the data unit; otherwise InvalidLength.
+    variant: "gb" doubles the tweak as GB/T 17964-2021 does, "ieee" as IEEE
+    1619-2018; they differ from the second block on.
+    """
+
+    tweak: bytes
+    variant: Variant = "gb"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tweak", as_exact_bytes(self.tweak, "tweak", 16))
+        check_variant(self.variant)
+
+
+Mode: TypeAlias = ECB | CBC | CFB | OFB | CTR | XTS
+
+
+class _Transform(Protocol):
+    """What a mode does with a stream of bytes, in one direction."""
+
+    def update(self, data: bytes) -> bytes: ...
+
+    def finalize(self) -> bytes: ...
+
+
+class _Blocks:
+    """Streams of whole blocks: keeps an incomplete block back, refuses one at the end."""
+
+    def __init__(self, process: Callable[[bytes], bytes]) -> None:
+        self._process = process
+        self._pending = b""
+
+    def update(self, data: bytes) -> bytes:
+        data = self._pending + data
+        whole = len(data) & ~15
+        self._pending = data[whole:]
+        return self._process(data[:whole])
+
+    def finalize(self) -> bytes:
+        if self._pending:
+            raise InvalidLength("without padding the data must be a multiple of 16 bytes")
+        return b""
+
+
+class _CBCEncrypt:
+    def __init__(self, engine: Engine, iv: bytes) -> None:
+        self._engine, self._chain = engine, iv
+
+    def __call__(self, blocks: bytes) -> bytes:
+        out = []
+        for i in range(0, len(blocks), 16):
+            self._chain = self._engine.encrypt(_xor(blocks[i : i + 16], self._chain))
+            out.append(self._chain)
+        return b"".join(out)
+
+
+class _CBCDecrypt:
+    def __init__(self, engine: Engine, iv: bytes) -> None:
+        self._engine, self._chain = engine, iv
+
+    def __call__(self, blocks: bytes) -> bytes:
+        chained = self._chain + blocks
+        self._chain = chained[-16:]
+        return _xor(self._engine.decrypt(blocks), chained[: len(blocks)])
+
+
+class _KeyStream:
+    """CTR and OFB: XOR with a stream that does not depend on the data; what is left of a block is kept."""
+
+    def __init__(self, stream: Callable[[bytes], bytes]) -> None:
+        self._xor_stream = stream
+        self._left = b""
+
+    def update(self, data: bytes) -> bytes:
+        head = data[: len(self._left)]
+        stream, self._left = self._left[: len(head)], self._left[len(head) :]
+        rest = data[len(head) :]
+        padded = rest + bytes(-len(rest) % 16)
+        out = self._xor_stream(padded)
+        if len(padded) > len(rest):
+            self._left = out[len(rest) :]
+        return _xor(head, stream) + out[: len(rest)]
+
+    def finalize(self) -> bytes:
+        return b""
+
+
+class _CTR:
+    def __init__(self, engine: Engine, nonce: bytes) -> None:
+        self._engine, self._counter = engine, int.from_bytes(nonce, "big")
+
+    def __call__(self, data: bytes) -> bytes:
+        first = self._counter.to_bytes(16, "big")
+        self._counter = (self._counter + len(data) // 16) % (1 << 128)
+        return self._engine.ctr_xor(first, data)
+
+
+class _OFB:
+    def __init__(self, engine: Engine, iv: bytes) -> None:
+        self._engine, self._register = engine, iv
+
+    def __call__(self, data: bytes) -> bytes:
+        stream = []
+        for _ in range(0, len(data), 16):
+            self._register = self._engine.encrypt(self._register)
+            stream.append(self._register)
+        return _xor(data, b"".join(stream))
+
+
+class _CFB:
+    """CFB-128: the register is the last 16 bytes of ciphertext; an incomplete block waits for the rest of it."""
+
+    def __init__(self, engine: Engine, iv: bytes, *, encrypting: bool) -> None:
+        self._engine, self._encrypting = engine, encrypting
+        self._mask = b""
+        self._register = iv
+
+    def update(self, data: bytes) -> bytes:
+        out = []
+        position = 0
+        while position < len(data):
+            if not self._mask:
+                self._mask, self._register = self._engine.encrypt(self._register), b""
+            piece = data[position : position + len(self._mask)]
+            mask, self._mask = self._mask[: len(piece)], self._mask[len(piece) :]
+            result = _xor(piece, mask)
+            self._register += result if self._encrypting else piece
+            out.append(result)
+            position += len(piece)
+        return b"".join(out)
+
+    def finalize(self) -> bytes:
+        return b""
+
+
+class _Pad:
+    """PKCS#7 in front of a block mode, RFC 5652 6.3: 1 to 16 bytes, each saying how many."""
+
+    def __init__(self, inner: _Transform) -> None:
+        self._inner, self._length = inner, 0
+
+    def update(self, data: bytes) -> bytes:
+        self._length += len(data)
+        return self._inner.update(data)
+
+    def finalize(self) -> bytes:
+        count = 16 - self._length % 16
+        return self._inner.update(bytes([count]) * count) + self._inner.finalize()
+
+
+class _Unpad:
+    """The inverse of `_Pad`: holds the last block back until the end is known."""
+
+    def __init__(self, inner: _Transform) -> None:
+        self._inner, self._length, self._held = inner, 0, b""
+
+    def update(self, data: bytes) -> bytes:
+        self._length += len(data)
+        plain = self._held + self._inner.update(data)
+        ready = max(0, len(plain) - 16)
+        self._held = plain[ready:]
+        return plain[:ready]
+
+    def finalize(self) -> bytes:
+        if self._length == 0 or self._length % 16:
+            raise InvalidPadding("the padding is malformed")
+        return remove_pkcs7(self._held)
+
+
+def remove_pkcs7(block: bytes) -> bytes:
+    """The last block without its padding, or InvalidPadding; looks at all 16 bytes whatever it finds."""
+    count = block[15]
+    wrong = int(count == 0) | int(count > 16)
+    for i in range(16):
+        inside = int(i < count)
+        wrong |= inside * (block[15 - i] ^ count)
+    if wrong:
+        raise InvalidPadding("the padding is malformed")
+    return block[: 16 - count]
+
+
+class CipherStream:
+    """One encryption or decryption under way; made by `Cipher.encryptor()` and `Cipher.decryptor()`.
+
+    The outputs of all `update` calls and of `finalize`, joined, do not depend
+    on how the data was cut.
+    """
+
+    __slots__ = ("_transform",)
+
+    def __init__(self, transform: _Transform) -> None:
+        self._transform: _Transform | None = transform
+
+    def update(self, data: BytesLike) -> bytes:
+        """Take more data, return what is ready; after `finalize`, AlreadyFinalized."""
+        data = as_bytes(data, "data")
+        if self._transform is None:
+            raise AlreadyFinalized("this stream was finalized")
+        return self._transform.update(data)
+
+    def finalize(self) -> bytes:
+        """Return the rest; InvalidLength or InvalidPadding where the whole does not fit; only once."""
+        if self._transform is None:
+            raise AlreadyFinalized("this stream was finalized")
+        transform, self._transform = self._transform, None
+        return transform.finalize()
+
+
+@dataclass(frozen=True, slots=True)
+class Cipher:
+    """A key joined with a mode, GB/T 17964-2021.
+
+    key: 16 bytes, for XTS 32; otherwise InvalidKey.
+    padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+    """
+
+    key: bytes = field(repr=False)
+    mode: Mode
+    padding: Padding = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "key", as_bytes(self.key, "key"))
+        if not isinstance(self.mode, Mode):
+            raise TypeError(f"mode must be a mode of sm4, not {type(self.mode).__name__}")
+        if self.padding not in (None, "pkcs7"):
+            raise InvalidOption('padding must be None or "pkcs7"')
+        if self.padding and not isinstance(self.mode, ECB | CBC):
+            raise InvalidOption(f"{type(self.mode).__name__} takes no padding")
+        length = 32 if isinstance(self.mode, XTS) else 16
+        if len(self.key) != length:
+            raise InvalidKey(f"SM4-{type(self.mode).__name__} takes a key of {length} bytes, not {len(self.key)}")
+
+    def encryptor(self) -> CipherStream:
+        """A new stream that encrypts."""
+        return CipherStream(_transform(self, encrypting=True))
+
+    def decryptor(self) -> CipherStream:
+        """A new stream that decrypts."""
+        return CipherStream(_transform(self, encrypting=False))
+
+
+def _transform(cipher: Cipher, *, encrypting: bool) -> _Transform:
+    mode = cipher.mode
+    if isinstance(mode, XTS):
+        return XTSStream(cipher.key, mode.tweak, mode.variant, encrypting=encrypting)
+    engine = Engine(cipher.key)
+    match mode:
+        case CTR():
+            return _KeyStream(_CTR(engine, mode.nonce))
+        case OFB():
+            return _KeyStream(_OFB(engine, mode.iv))
+        case CFB():
+            return _CFB(engine, mode.iv, encrypting=encrypting)
+        case ECB():
+            inner = _Blocks(engine.encrypt if encrypting else engine.decrypt)
+        case CBC():
+            inner = _Blocks(_CBCEncrypt(engine, mode.iv) if encrypting else _CBCDecrypt(engine, mode.iv))
+    if cipher.padding is None:
+        return inner
+    return _Pad(inner) if encrypting else _Unpad(inner)
+
+
+def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = None) -> bytes:
+    """`data` encrypted in one call.
+
+    key: 16 bytes, for XTS 32; otherwise InvalidKey.
+    data: whole blocks for ECB and CBC without padding, 16 bytes or more for
+    XTS, otherwise InvalidLength; any length for CFB, OFB, CTR, and with padding.
+    padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+    """
+    stream = Cipher(as_bytes(key, "key"), mode, padding=padding).encryptor()
+    return stream.update(data) + stream.finalize()
+
+
+def decrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = None) -> bytes:
+    """The inverse of `encrypt`, with the same errors.
+
+    With padding="pkcs7", data that is empty, not whole blocks, or does not
+    end in well-formed padding is InvalidPadding. Do not tell an attacker
+    which decryptions fail: that alone reveals CBC plaintext.
+    """
+    stream = Cipher(as_bytes(key, "key"), mode, padding=padding).decryptor()
+    return stream.update(data) + stream.finalize()
