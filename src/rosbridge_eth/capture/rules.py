@@ -1,0 +1,153 @@
+"""What is captured of which topic: fields, rate, moment or period, delivery class, oversize.
+
+All times are compared with a message's receive time, so a bag gives the same
+records at any replay speed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rosbridge_eth.capture.conversion import DEFAULT_LIMIT, OversizePolicy
+from rosbridge_eth.capture.record import Delivery
+
+
+@dataclass(frozen=True)
+class TopicRule:
+    """How the topics that match `topic` are captured.
+
+    topic: a name, or a pattern: `*` and `?` within one part of a name, `**` across parts, `[ab]`.
+    fields: paths; empty means the type's default fields.
+    rate: records a second at most; None for every message.
+    at_ns: only the first message received at this moment or after it.
+    once: only the first message (of the period).
+    from_ns, until_ns: only messages received in [from, until).
+    for_ns: length of the period: from `from_ns`, or from the first message if that is None.
+    delivery: "reliable", or "latest": a newer record may supersede it while it waits.
+    oversize, limit: what becomes of a field above `limit` bytes.
+    """
+
+    topic: str
+    fields: tuple[str, ...] = ()
+    rate: float | None = None
+    at_ns: int | None = None
+    once: bool = False
+    from_ns: int | None = None
+    until_ns: int | None = None
+    for_ns: int | None = None
+    delivery: Delivery = "reliable"
+    oversize: OversizePolicy = "digest"
+    limit: int = DEFAULT_LIMIT
+
+
+class Schedule:
+    """Which messages of one topic are due, by their receive times.
+
+    The rate is kept by the generic cell rate algorithm (ITU-T I.371) with a
+    tolerance of half a period: a 10 Hz topic that jitters passes a rate of 10
+    undiminished, and no window of T seconds has more than rate * T + 1.5 records.
+    """
+
+    def __init__(self, rule: TopicRule) -> None:
+        self._start = rule.from_ns if rule.at_ns is None else rule.at_ns
+        self._end = rule.until_ns
+        self._length = rule.for_ns
+        self._single = rule.once or rule.at_ns is not None
+        self._done = False
+        self._period = 0 if rule.rate is None else round(1e9 / rule.rate)
+        self._next: int | None = None
+        self._set_end()
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more will be due, whatever comes."""
+        return self._done
+
+    def due(self, received_ns: int) -> bool:
+        """Whether a message received then should be captured; `captured` tells that it was."""
+        if self._done or (self._start is not None and received_ns < self._start):
+            return False
+        if self._start is None and self._length is not None:
+            self._start = received_ns
+            self._set_end()
+        if self._end is not None and received_ns >= self._end:
+            return False
+        if self._next is None or not self._period:
+            return True
+        early = self._next - received_ns
+        # After a step back of the clock the next one is more than 1.5 periods ahead, which it cannot be otherwise.
+        return 2 * early <= self._period or 2 * early > 3 * self._period
+
+    def captured(self, received_ns: int) -> None:
+        """A due message became a record. One that could not be decoded does not count."""
+        self._done = self._single
+        if self._period:
+            stepped_back = self._next is not None and 2 * (self._next - received_ns) > 3 * self._period
+            next_one = received_ns if self._next is None or stepped_back else max(self._next, received_ns)
+            self._next = next_one + self._period
+
+    def _set_end(self) -> None:
+        if self._start is not None and self._length is not None:
+            end = self._start + self._length
+            self._end = end if self._end is None else min(end, self._end)
+
+
+class NamePattern:
+    """A topic's or node's name, or a pattern of names."""
+
+    def __init__(self, pattern: str) -> None:
+        """Raises ValueError with a sentence."""
+        self.text = pattern if pattern.startswith(("/", "**")) else f"/{pattern}"
+        self.is_exact = not set(pattern) & set("*?[")
+        self._expression = re.compile(_expression(self.text), re.ASCII)
+
+    def __repr__(self) -> str:
+        return f"NamePattern({self.text!r})"
+
+    def matches(self, name: str) -> bool:
+        """Whether `name` (with its leading slash) is meant."""
+        return self._expression.fullmatch(name) is not None
+
+
+_GLOB = re.compile(r"\*\*|\*|\?|\[[A-Za-z0-9_\-]+\]|[A-Za-z0-9_/]+", re.ASCII)
+
+
+def _expression(pattern: str) -> str:
+    parts = []
+    position = 0
+    while position < len(pattern):
+        match = _GLOB.match(pattern, position)
+        if match is None:
+            raise ValueError(
+                f"{pattern!r} is not a name or pattern: names have letters, digits, _ and /, patterns *, **, ? and [ab]"
+            )
+        piece = match[0]
+        position = match.end()
+        if piece == "**":
+            parts.append(r".*")
+        elif piece == "*":
+            parts.append(r"[^/]*")
+        elif piece == "?":
+            parts.append(r"[^/]")
+        else:
+            parts.append(piece)  # literal characters, or a class, which reads the same in both notations
+    if "//" in pattern or not parts:
+        raise ValueError(f"{pattern!r} is not a name or pattern: it has an empty part")
+    try:
+        re.compile("".join(parts))
+    except re.error:
+        raise ValueError(f"{pattern!r} is not a pattern: a range in [...] is out of order") from None
+    return "".join(parts)
+
+
+def rule_for(topic: str, rules: Sequence[tuple[NamePattern, TopicRule]]) -> TopicRule | None:
+    """The rule of a topic: the one that names it, otherwise the first whose pattern matches."""
+    for pattern, rule in rules:
+        if pattern.is_exact and pattern.matches(topic):
+            return rule
+    for pattern, rule in rules:
+        if pattern.matches(topic):
+            return rule
+    return None

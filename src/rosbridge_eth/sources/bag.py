@@ -1,0 +1,185 @@
+"""Bags: ROS 1 (.bag) and ROS 2 (a folder with metadata.yaml, .db3, .mcap), by rosbags, without ROS.
+
+Messages come in the order of their receive times, at the recorded pace, faster,
+slower, or as fast as they are taken. Definitions come out of the bag and are
+checked like those of a live publisher; a ROS 2 bag without definitions (before
+Iron, sqlite3) is read with those that its distribution ships.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+
+from rosbridge_eth.capture import (
+    Decoder,
+    RawMessage,
+    Wire,
+    decoder_for,
+    decoder_for_known,
+    normalised_type_name,
+)
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.selection import Selection
+
+MAX_WAIT_NS = 3600 * 10**9
+"""A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
+
+
+@dataclass(frozen=True)
+class BagSettings:
+    """What of a bag is replayed, and how fast.
+
+    speed: 1.0 is the recorded pace; None is as fast as messages are taken.
+    start_ns, stop_ns: replay [start, stop) of the recording, counted from its first message.
+    """
+
+    kind: ClassVar[str] = "bag"
+    path: Path
+    speed: float | None = 1.0
+    start_ns: int = 0
+    stop_ns: int | None = None
+
+
+class BagSource:
+    """One bag; it can be run again and then starts anew."""
+
+    live = False
+
+    def __init__(self, settings: BagSettings, selection: Selection, clock: Clock | None = None) -> None:
+        """Opens the bag and resolves the selection. Raises SourceError."""
+        self._settings = settings
+        self._clock = clock or SystemClock()
+        self._where = f"bag {settings.path}"
+        self._wire = Wire.ROS1 if settings.path.suffix == ".bag" else Wire.CDR
+        self._reader: Rosbag1Reader | Rosbag2Reader | None = None
+        if not settings.path.exists():
+            raise SourceError(f"{self._where} does not exist")
+        with self._translated():
+            reader = Rosbag1Reader(settings.path) if self._wire is Wire.ROS1 else Rosbag2Reader(settings.path)
+            reader.open()
+            self._reader = reader
+            self._connections = [
+                (connection, _offer_name(connection), normalised_type_name(connection.msgtype))
+                for connection in reader.connections
+            ]
+            self._distribution = reader.ros_distro if isinstance(reader, Rosbag2Reader) else None
+            self._start = reader.start_time
+        try:
+            self._offers = self._read_offers()
+            self._watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
+            self._decoders = {
+                connection.id: self._decoder(connection)
+                for connection, topic, _ in self._connections
+                if topic in self._watched
+            }
+        except SourceError:
+            self.close()
+            raise
+
+    def offers(self) -> Sequence[Offer]:
+        """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
+        return self._offers
+
+    def decoders(self) -> dict[str, list[Decoder]]:
+        """The decoders of each watched topic, to check a configuration before the replay."""
+        found: dict[str, list[Decoder]] = {}
+        for connection, topic, _ in self._connections:
+            if connection.id in self._decoders:
+                found.setdefault(topic, []).append(self._decoders[connection.id])
+        return found
+
+    @property
+    def message_count(self) -> int:
+        """Messages of the watched topics in the whole bag."""
+        return sum(connection.msgcount for connection, _, _ in self._connections if connection.id in self._decoders)
+
+    def messages(self) -> Iterator[RawMessage]:
+        """The watched messages, in order, without waiting. Raises SourceError."""
+        if self._reader is None:
+            raise SourceError(f"{self._where} is closed")
+        first = self._start + self._settings.start_ns
+        stop = None if self._settings.stop_ns is None else self._start + self._settings.stop_ns
+        topics = {connection.id: (topic, name) for connection, topic, name in self._connections}
+        chosen = [connection for connection, _, _ in self._connections if connection.id in self._decoders]
+        with self._translated():
+            for connection, received_ns, raw in self._reader.messages(chosen, first, stop):
+                topic, type_name = topics[connection.id]
+                yield RawMessage(topic, type_name, received_ns, bytes(raw), self._decoders[connection.id])
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Replay at the set speed until the end or `stop`. Raises SourceError."""
+        speed, due, last = self._settings.speed, 0, None
+        for message in self.messages():
+            if speed is not None:
+                if last is None:
+                    due = self._clock.monotonic_ns()
+                else:
+                    due += round(min(max(message.received_ns - last, 0), MAX_WAIT_NS) / speed)
+                last = message.received_ns
+                if self._clock.wait_until(due, stop):
+                    return
+            elif stop.is_set():
+                return
+            emit(message)
+
+    def close(self) -> None:
+        """Close the file."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            with self._translated():
+                reader.close()
+
+    def _read_offers(self) -> tuple[Offer, ...]:
+        nodes: dict[tuple[str, str], set[str]] = {}
+        for connection, topic, type_name in self._connections:
+            publishers = nodes.setdefault((topic, type_name), set())
+            if isinstance(connection.ext, ConnectionExtRosbag1) and connection.ext.callerid:
+                publishers.add(connection.ext.callerid)
+        return tuple(Offer(topic, name, tuple(sorted(found))) for (topic, name), found in sorted(nodes.items()))
+
+    def _decoder(self, connection: Connection) -> Decoder:
+        definition = connection.msgdef
+        if definition.format is MessageDefinitionFormat.NONE:
+            known = decoder_for_known(self._wire, connection.msgtype, self._distribution)
+            if known is None:
+                raise SourceError(
+                    f"{self._where} does not define {connection.msgtype} of {connection.topic}, which ROS does not "
+                    "ship; record it as mcap, which stores definitions, or leave the topic out"
+                )
+            return known
+        form = "idl" if definition.format is MessageDefinitionFormat.IDL else "msg"
+        try:
+            return decoder_for(self._wire, connection.msgtype, definition.data, form)
+        except SourceError as error:
+            raise SourceError(f"{self._where}, topic {connection.topic}: {error}") from None
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Whatever reading a damaged bag runs into is one SourceError."""
+        try:
+            yield
+        except (SourceError, GeneratorExit):
+            raise
+        except PermissionError:
+            raise SourceError(f"{self._where} cannot be read: permission denied") from None
+        except Exception as error:
+            # rosbags passes on what its parts raise (struct, sqlite, YAML, decompressors, assertions):
+            # the set is open, and each of them means that the file is not what it should be.
+            detail = str(error).strip().rstrip(".").partition("\n")[0] or type(error).__name__
+            mend = "; run `rosbag reindex` on it" if "not indexed" in detail else ""
+            raise SourceError(f"{self._where} is damaged or not a bag: {detail}{mend}") from error
+
+
+def _offer_name(connection: Connection) -> str:
+    """The topic with its leading slash, which old recorders left out."""
+    return connection.topic if connection.topic.startswith("/") else f"/{connection.topic}"

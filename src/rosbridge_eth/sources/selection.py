@@ -1,0 +1,112 @@
+"""Which of the topics that a source offers are watched: by topic or by node, by name or by pattern.
+
+A node stands for the topics it publishes. Live sources resolve again every few
+seconds (Watch), since nodes and topics come and go.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from rosbridge_eth.capture import NamePattern
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.protocol import Offer
+
+RESOLVE_EVERY = 3.0
+"""Seconds after which a live source looks for new topics and nodes."""
+
+
+class Selection:
+    """Names and patterns of topics and of nodes; a topic is watched if any of them means it."""
+
+    def __init__(self, topics: Iterable[str] = (), nodes: Iterable[str] = ()) -> None:
+        """Raises ValueError with a sentence for a malformed pattern."""
+        self._topics = [NamePattern(topic) for topic in topics]
+        self._nodes = [NamePattern(node) for node in nodes]
+
+    @property
+    def names_nodes(self) -> bool:
+        """Whether nodes are to be watched: the source must know who publishes."""
+        return bool(self._nodes)
+
+    def wants(self, offer: Offer) -> bool:
+        """Whether a topic is watched."""
+        return any(pattern.matches(offer.topic) for pattern in self._topics) or any(
+            pattern.matches(node) for pattern in self._nodes for node in offer.nodes
+        )
+
+    def resolve(self, offers: Iterable[Offer]) -> tuple[Offer, ...]:
+        """The watched topics among those offered."""
+        return tuple(offer for offer in offers if self.wants(offer))
+
+    def unmatched(self, offers: Sequence[Offer]) -> tuple[str, ...]:
+        """The names and patterns that mean nothing of what is offered."""
+        nodes = {node for offer in offers for node in offer.nodes}
+        return (
+            *(p.text for p in self._topics if not any(p.matches(offer.topic) for offer in offers)),
+            *(p.text for p in self._nodes if not any(p.matches(node) for node in nodes)),
+        )
+
+    def resolve_all(self, offers: Sequence[Offer], where: str) -> tuple[Offer, ...]:
+        """As resolve, for a source that will not offer more: SourceError if a name means nothing of it.
+
+        A pattern may match nothing as long as something is watched.
+        """
+        chosen = self.resolve(offers)
+        exact = {pattern.text for pattern in (*self._topics, *self._nodes) if pattern.is_exact}
+        missing = [name for name in self.unmatched(offers) if name in exact or not chosen]
+        if not missing and chosen:
+            return chosen
+        nodes = sorted({node for offer in offers for node in offer.nodes})
+        near = difflib.get_close_matches(missing[0], [*(offer.topic for offer in offers), *nodes], 1) if missing else []
+        hint = f"did you mean {near[0]}? " if near else ""
+        topics = ", ".join(map(str, offers[:20])) or "no topics"
+        more = f" and {len(offers) - 20} more" if len(offers) > 20 else ""
+        raise SourceError(
+            f"{where} has no topic or node {', '.join(missing)}; {hint}"
+            f"It has {topics}{more}" + (f", published by {', '.join(nodes[:20])}" if nodes else "")
+            + ("" if nodes or not self.names_nodes else "; it does not say which nodes published: name topics")
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What to subscribe to and what to leave, after resolving again."""
+
+    added: tuple[Offer, ...]
+    removed: tuple[Offer, ...]
+
+
+class Watch:
+    """The selection over time, for live sources: ask the master when due, subscribe to what was added.
+
+    `now` is monotonic seconds. A type that changes under a topic's name is one
+    removal and one addition.
+    """
+
+    def __init__(self, selection: Selection, every: float = RESOLVE_EVERY) -> None:
+        self._selection = selection
+        self._every = every
+        self._due: float | None = None
+        self.watched: dict[tuple[str, str], Offer] = {}
+
+    def next_timer(self) -> float | None:
+        """When to ask again; None means now, for the first time."""
+        return self._due
+
+    def failed(self, now: float) -> None:
+        """The master did not answer: nothing is left for that, ask again later."""
+        self._due = now + self._every
+
+    def update(self, offers: Iterable[Offer], now: float) -> Changes:
+        """Take what is offered now; what changed among the watched topics."""
+        self._due = now + self._every
+        chosen = {(offer.topic, offer.type_name): offer for offer in self._selection.resolve(offers)}
+        changes = Changes(
+            tuple(offer for key, offer in chosen.items() if key not in self.watched),
+            tuple(offer for key, offer in self.watched.items() if key not in chosen),
+        )
+        self.watched = chosen
+        return changes

@@ -1,0 +1,184 @@
+"""A simulated robot for a machine without one: nav_msgs/Odometry and sensor_msgs/Imu, as ROS 1 writes them.
+
+A differential-drive robot on a figure eight. The motion is a pure function of
+the seed and the tick (`drive`); `SimSource` gives it a pace.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy
+
+from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for_known
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.selection import Selection
+
+SPEED = 0.5
+"""Metres per second along the path."""
+RADIUS = 1.0
+"""Metres; of each of the two circles."""
+SPEED_NOISE = 0.01
+TURN_NOISE = 0.01
+"""Standard deviations, m/s and rad/s: how badly the wheels follow the command."""
+GRAVITY = 9.80665
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+
+
+@dataclass(frozen=True)
+class SimSettings:
+    """rate: of odometry and of IMU messages, Hz. duration_ns: None is endless. speed: as of a bag."""
+
+    kind: ClassVar[str] = "sim"
+    robot: str = "robot_1"
+    seed: int = 1
+    rate: float = 10.0
+    duration_ns: int | None = None
+    speed: float | None = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where the robot is and how it moves: metres, radians, seconds; heading in (-pi, pi]."""
+
+    x: float = 0.0
+    y: float = 0.0
+    heading: float = 0.0
+    speed: float = 0.0
+    turn: float = 0.0
+
+
+def advance(motion: Motion, speed: float, turn: float, dt: float) -> Motion:
+    """Drive for `dt` at a constant speed and turn rate: an arc, or a line where the turn rate vanishes."""
+    heading = motion.heading + turn * dt
+    if abs(turn) < 1e-9:
+        x = motion.x + speed * dt * math.cos(motion.heading)
+        y = motion.y + speed * dt * math.sin(motion.heading)
+    else:
+        x = motion.x + speed / turn * (math.sin(heading) - math.sin(motion.heading))
+        y = motion.y - speed / turn * (math.cos(heading) - math.cos(motion.heading))
+    return Motion(x, y, math.remainder(heading, math.tau), speed, turn)
+
+
+def drive(seed: int, rate: float) -> Iterator[Motion]:
+    """The motion at each tick of 1/rate seconds, endlessly; the same for the same arguments."""
+    noise = random.Random(seed)  # noqa: S311 - simulated wheel slip, nothing secret
+    lap = math.tau * RADIUS / SPEED
+    motion, tick = Motion(), 0
+    while True:
+        yield motion
+        left = int(tick / rate / lap) % 2 == 0
+        speed = SPEED + noise.gauss(0, SPEED_NOISE)
+        turn = (SPEED / RADIUS if left else -SPEED / RADIUS) + noise.gauss(0, TURN_NOISE)
+        motion = advance(motion, speed, turn, 1 / rate)
+        tick += 1
+
+
+class SimSource:
+    """The simulated robot as a source: `/NAME/odom` and `/NAME/imu`, published by the node `/NAME/sim`."""
+
+    live = False
+
+    def __init__(self, settings: SimSettings, selection: Selection, clock: Clock | None = None) -> None:
+        """Raises SourceError if the selection names what the robot does not have."""
+        self._settings = settings
+        self._clock = clock or SystemClock()
+        node = f"/{settings.robot}/sim"
+        self._offers = (
+            Offer(f"/{settings.robot}/imu", IMU, (node,)),
+            Offer(f"/{settings.robot}/odom", ODOMETRY, (node,)),
+        )
+        chosen = selection.resolve_all(self._offers, "the simulated robot")
+        self._watched = {offer.topic: _decoder(offer.type_name) for offer in chosen}
+
+    def offers(self) -> Sequence[Offer]:
+        """Odometry and IMU."""
+        return self._offers
+
+    def decoders(self) -> dict[str, list[Decoder]]:
+        """The decoders of each watched topic, to check a configuration beforehand."""
+        return {topic: [decoder] for topic, decoder in self._watched.items()}
+
+    def messages(self, start_ns: int) -> Iterator[RawMessage]:
+        """The watched messages from a start time on, without waiting."""
+        period = 1e9 / self._settings.rate
+        for tick, motion in enumerate(drive(self._settings.seed, self._settings.rate)):
+            passed = round(tick * period)
+            if self._settings.duration_ns is not None and passed >= self._settings.duration_ns:
+                return
+            for offer in self._offers:
+                if decoder := self._watched.get(offer.topic):
+                    build = _odometry if offer.type_name == ODOMETRY else _imu
+                    message = build(decoder.typestore.types, self._settings.robot, tick, start_ns + passed, motion)
+                    raw = decoder.encode(message)
+                    yield RawMessage(offer.topic, offer.type_name, start_ns + passed, raw, decoder)
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Publish at the set speed until the duration is over or `stop` is set."""
+        wall, monotonic, speed = self._clock.wall_ns(), self._clock.monotonic_ns(), self._settings.speed
+        for message in self.messages(wall):
+            if speed is None:
+                if stop.is_set():
+                    return
+            elif self._clock.wait_until(monotonic + round((message.received_ns - wall) / speed), stop):
+                return
+            emit(message)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def _decoder(type_name: str) -> Decoder:
+    decoder = decoder_for_known(Wire.ROS1, type_name)
+    if decoder is None:
+        raise SourceError(f"this version of rosbags does not know {type_name}")
+    return decoder
+
+
+def _header(types: Any, frame: str, tick: int, stamp_ns: int) -> Any:
+    time = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+    return types["std_msgs/msg/Header"](tick, time, frame)
+
+
+def _odometry(types: Any, robot: str, tick: int, stamp_ns: int, motion: Motion) -> Any:
+    unknown = numpy.zeros(36)
+    vector = types["geometry_msgs/msg/Vector3"]
+    return types[ODOMETRY](
+        _header(types, f"{robot}/odom", tick, stamp_ns),
+        f"{robot}/base_link",
+        types["geometry_msgs/msg/PoseWithCovariance"](
+            types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](motion.x, motion.y, 0.0), _orientation(types, motion)
+            ),
+            unknown,
+        ),
+        types["geometry_msgs/msg/TwistWithCovariance"](
+            types["geometry_msgs/msg/Twist"](vector(motion.speed, 0.0, 0.0), vector(0.0, 0.0, motion.turn)), unknown
+        ),
+    )
+
+
+def _imu(types: Any, robot: str, tick: int, stamp_ns: int, motion: Motion) -> Any:
+    unknown = numpy.zeros(9)
+    vector = types["geometry_msgs/msg/Vector3"]
+    return types[IMU](
+        _header(types, f"{robot}/imu", tick, stamp_ns),
+        _orientation(types, motion),
+        unknown,
+        vector(0.0, 0.0, motion.turn),
+        unknown,
+        vector(0.0, motion.speed * motion.turn, GRAVITY),  # centripetal, and the table that holds it up
+        unknown,
+    )
+
+
+def _orientation(types: Any, motion: Motion) -> Any:
+    return types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(motion.heading / 2), math.cos(motion.heading / 2))
