@@ -1,0 +1,201 @@
+"""Is a certificate to be trusted? Path building and validation, RFC 5280, 6.1; RFC 4158.
+
+`verify_chain` looks for a path from the leaf to a root: at each step every
+certificate whose subject is the current issuer is tried, roots first, so that
+several intermediates, cross-signed ones and ones of the same name all work.
+The search is bounded, whatever the pile of intermediates looks like.
+
+Not here: name constraints and policies. A CA certificate with name constraints, and any
+certificate with a critical extension that is not in `_PROCESSED`, is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Final
+
+from smcrypto import sm2
+from smcrypto.errors import CertificateError
+from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.x509 import extensions as ext
+from smcrypto.x509.certificate import Certificate
+from smcrypto.x509.signed import instant
+
+__all__ = ["MAX_PATH", "verify_chain"]
+
+MAX_PATH: Final = 10
+"""The most certificates in a path, leaf and root included."""
+_MAX_STEPS: Final = 1000  # candidates looked at in one search
+_MAX_SIGNATURES: Final = 100  # signatures verified in one search
+
+# Extensions that are processed here or bind nobody but the subject, and so may be critical.
+_PROCESSED: Final = frozenset(
+    {
+        ext.BASIC_CONSTRAINTS,
+        ext.KEY_USAGE,
+        ext.EXTENDED_KEY_USAGE,
+        ext.SUBJECT_ALT_NAME,
+        ext.SUBJECT_KEY_IDENTIFIER,
+        ext.AUTHORITY_KEY_IDENTIFIER,
+    }
+)
+
+
+def verify_chain(
+    leaf: Certificate,
+    *,
+    intermediates: Iterable[Certificate] = (),
+    roots: Iterable[Certificate],
+    at: datetime,
+    uid: BytesLike = sm2.DEFAULT_UID,
+    extended_key_usage: str | Iterable[str] | None = None,
+    key_usage: str | Iterable[str] | None = None,
+) -> tuple[Certificate, ...]:
+    """The path from `leaf` to one of `roots`, both included; CertificateError, saying why, if there is none.
+
+    at: the moment, aware. uid: of every signature in the path.
+    extended_key_usage: purposes that the leaf, and every CA that restricts them, must allow.
+    key_usage: usages that the leaf must allow. Certificates without these extensions allow everything.
+    """
+    for certificate in (leaf, *(intermediates := tuple(intermediates)), *(roots := tuple(roots))):
+        if not isinstance(certificate, Certificate):
+            raise TypeError(f"a Certificate is needed, not {type(certificate).__name__}")
+    search = _Search(intermediates, roots, instant(at, "at"), as_bytes(uid, "uid"), _names(extended_key_usage))
+    usages = ext.usage_names(_names(key_usage))
+    if leaf.key_usage is not None and not usages <= leaf.key_usage:
+        raise CertificateError(f"{leaf.subject} may not be used for {', '.join(sorted(usages - leaf.key_usage))}")
+    return search.from_leaf(leaf)
+
+
+def _names(names: str | Iterable[str] | None) -> tuple[str, ...]:
+    if names is None:
+        return ()
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+class _Search:
+    """One depth-first search; keeps the refusal that came furthest, which is the one worth telling."""
+
+    def __init__(
+        self,
+        intermediates: tuple[Certificate, ...],
+        roots: tuple[Certificate, ...],
+        at: datetime,
+        uid: bytes,
+        purposes: tuple[str, ...],
+    ) -> None:
+        self.roots = frozenset(roots)
+        self.candidates = tuple(dict.fromkeys(roots + intermediates))
+        self.at = at
+        self.uid = uid
+        self.purposes = frozenset(map(ext.purpose_name, purposes))
+        self.steps = 0
+        self.signatures: dict[tuple[Certificate, Certificate], CertificateError | None] = {}
+        self.refusal: tuple[int, CertificateError] | None = None
+
+    def from_leaf(self, leaf: Certificate) -> tuple[Certificate, ...]:
+        self.require_fit(leaf)
+        path = self.extend((leaf,))
+        if path is not None:
+            return path
+        if self.refusal is not None:
+            raise self.refusal[1]
+        raise CertificateError(f"no issuer {leaf.issuer} is known for {leaf.subject}")
+
+    def extend(self, path: tuple[Certificate, ...]) -> tuple[Certificate, ...] | None:
+        current = path[-1]
+        if current in self.roots:
+            return path
+        if len(path) >= MAX_PATH:
+            self.refused(path, CertificateError(f"the path is longer than {MAX_PATH} certificates"))
+            return None
+        found = False
+        for issuer in self.candidates:
+            self.steps += 1
+            if self.steps > _MAX_STEPS:
+                raise CertificateError(f"no path was found in {_MAX_STEPS} steps")
+            if not _may_have_issued(issuer, current) or any(_same_holder(issuer, other) for other in path):
+                continue
+            found = True
+            try:
+                self.require_fit(issuer)
+                _require_issuer(issuer, path)
+                self.require_signature(current, issuer)
+            except CertificateError as error:
+                self.refused(path, error)
+                continue
+            whole = self.extend((*path, issuer))
+            if whole is not None:
+                return whole
+        if not found:
+            trusted = "trusted root" if current.subject == current.issuer else "known issuer"
+            self.refused(path, CertificateError(f"no {trusted} {current.issuer} for {current.subject}"))
+        return None
+
+    def refused(self, path: tuple[Certificate, ...], error: CertificateError) -> None:
+        if self.refusal is None or len(path) > self.refusal[0]:
+            self.refusal = (len(path), error)
+
+    def require_fit(self, certificate: Certificate) -> None:
+        """What holds for every certificate of a path: validity (6.1.3 a 2), extensions (6.1.4 o), purposes."""
+        if self.at < certificate.not_before:
+            raise CertificateError(f"{certificate.subject} is not valid before {certificate.not_before}")
+        if self.at > certificate.not_after:
+            raise CertificateError(f"{certificate.subject} expired at {certificate.not_after}")
+        for extension in certificate.extensions:
+            if extension.critical and extension.oid not in _PROCESSED:
+                raise CertificateError(
+                    f"{certificate.subject} has the critical extension {extension.oid}, which is not understood"
+                )
+        allowed = certificate.extended_key_usage
+        if allowed is not None and "anyExtendedKeyUsage" not in allowed and not self.purposes <= set(allowed):
+            missing = ", ".join(sorted(self.purposes - set(allowed)))
+            raise CertificateError(f"{certificate.subject} is not for {missing}")
+
+    def require_signature(self, certificate: Certificate, issuer: Certificate) -> None:
+        pair = (certificate, issuer)
+        if pair not in self.signatures:
+            if len(self.signatures) >= _MAX_SIGNATURES:
+                raise CertificateError(f"no path was found with {_MAX_SIGNATURES} signatures")
+            try:
+                certificate.verify_signature(issuer, uid=self.uid)
+                self.signatures[pair] = None
+            except CertificateError as error:
+                self.signatures[pair] = error
+        failure = self.signatures[pair]
+        if failure is not None:
+            raise failure
+
+
+def _may_have_issued(issuer: Certificate, certificate: Certificate) -> bool:
+    """Do the names chain, and the key identifiers where both are there?"""
+    if issuer.subject != certificate.issuer:
+        return False
+    authority = certificate.authority_key_identifier
+    if authority is None:
+        return True
+    if authority.serial_number is not None and authority.serial_number != issuer.serial_number:
+        return False
+    wanted, found = authority.key_identifier, issuer.subject_key_identifier
+    return wanted is None or found is None or wanted == found
+
+
+def _same_holder(one: Certificate, other: Certificate) -> bool:
+    """The same name and key: a second one in a path is a detour or a loop (RFC 4158, 2.4.2 and 5.2)."""
+    return one.public_key == other.public_key and one.subject == other.subject
+
+
+def _require_issuer(issuer: Certificate, path: tuple[Certificate, ...]) -> None:
+    """May `issuer` have issued the last certificate of `path`? RFC 5280, 6.1.4 k, l, m, n."""
+    constraints = issuer.basic_constraints
+    if constraints is None or not constraints.ca:
+        raise CertificateError(f"{issuer.subject} is not a CA")
+    if issuer.key_usage is not None and "keyCertSign" not in issuer.key_usage:
+        raise CertificateError(f"{issuer.subject} may not sign certificates (no keyCertSign)")
+    # 4.2.1.9: intermediates that follow, self-issued ones and the leaf not counted.
+    followers = sum(1 for certificate in path[1:] if certificate.subject != certificate.issuer)
+    if constraints.path_length is not None and followers > constraints.path_length:
+        raise CertificateError(f"{issuer.subject} allows {constraints.path_length} intermediates, not {followers}")
+    if any(extension.oid == ext.NAME_CONSTRAINTS for extension in issuer.extensions):
+        raise CertificateError(f"{issuer.subject} has name constraints, which are not supported")

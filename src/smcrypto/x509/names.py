@@ -1,0 +1,298 @@
+"""Distinguished names: RFC 5280, 4.1.2.4 and 7.1; written as text by RFC 4514.
+
+A name keeps the bytes it was read from. Two names are the same when their
+attributes are, compared without regard to ASCII case, to runs of blanks and to
+which string type carries the text: the rules of RFC 5280, 7.1 but for Unicode
+normalisation, as OpenSSL has them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Final, NamedTuple
+
+from smcrypto import der
+from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
+
+__all__ = ["Attribute", "Name"]
+
+# Attribute types: short name (RFC 4514, 3, and OpenSSL's for the rest), identifier,
+# upper bound in characters on writing (RFC 5280, appendix A.1), string type on writing.
+_TYPES: Final = (
+    ("CN", "2.5.4.3", 64, der.UTF8_STRING),
+    ("SN", "2.5.4.4", 40, der.UTF8_STRING),
+    ("serialNumber", "2.5.4.5", 64, der.PRINTABLE_STRING),
+    ("C", "2.5.4.6", 2, der.PRINTABLE_STRING),
+    ("L", "2.5.4.7", 128, der.UTF8_STRING),
+    ("ST", "2.5.4.8", 128, der.UTF8_STRING),
+    ("STREET", "2.5.4.9", 128, der.UTF8_STRING),
+    ("O", "2.5.4.10", 64, der.UTF8_STRING),
+    ("OU", "2.5.4.11", 64, der.UTF8_STRING),
+    ("title", "2.5.4.12", 64, der.UTF8_STRING),
+    ("GN", "2.5.4.42", 16, der.UTF8_STRING),
+    ("initials", "2.5.4.43", 5, der.UTF8_STRING),
+    ("generationQualifier", "2.5.4.44", 3, der.UTF8_STRING),
+    ("dnQualifier", "2.5.4.46", 64, der.PRINTABLE_STRING),
+    ("pseudonym", "2.5.4.65", 128, der.UTF8_STRING),
+    ("UID", "0.9.2342.19200300.100.1.1", 256, der.UTF8_STRING),
+    ("DC", "0.9.2342.19200300.100.1.25", 63, der.IA5_STRING),
+    ("emailAddress", "1.2.840.113549.1.9.1", 255, der.IA5_STRING),
+)
+_BY_OID: Final = {oid: name for name, oid, _, _ in _TYPES}
+_BY_NAME: Final = {name.lower(): (oid, bound, tag) for name, oid, bound, tag in _TYPES}
+_DOTTED: Final = re.compile(r"[0-2](\.(0|[1-9][0-9]*))+")
+_PRINTABLE: Final = re.compile(r"[A-Za-z0-9 '()+,\-./:=?]*")  # X.680, 41.4
+# PrintableString is read more widely than X.680 allows, because CAs write "*", "@", "_" and "&" into it.
+_CODECS: Final = {
+    der.UTF8_STRING: "utf-8",
+    der.PRINTABLE_STRING: "ascii",
+    der.NUMERIC_STRING: "ascii",
+    der.IA5_STRING: "ascii",
+    der.VISIBLE_STRING: "ascii",
+    der.T61_STRING: "latin-1",
+    der.BMP_STRING: "utf-16-be",
+    der.UNIVERSAL_STRING: "utf-32-be",
+}
+_SPECIAL: Final = frozenset('"+,;<>\\')
+
+
+class Attribute(NamedTuple):
+    """One type and value; `text` is None where the value is not of a string type."""
+
+    oid: str
+    value: bytes
+    """The value in DER."""
+    text: str | None
+
+    @property
+    def type(self) -> str:
+        """The short name of the type, its dotted identifier where it has none."""
+        return _BY_OID.get(self.oid, self.oid)
+
+
+class Name:
+    """A distinguished name: relative names from the root of the tree downwards, each a set of attributes."""
+
+    __slots__ = ("_der", "_key", "_rdns")
+
+    def __init__(self, rdns: Iterable[Iterable[Attribute]] = ()) -> None:
+        self._rdns = tuple(tuple(sorted(rdn, key=_encode_attribute)) for rdn in rdns)
+        if not all(self._rdns):
+            raise InvalidOption("a relative distinguished name needs an attribute")
+        self._der = der.sequence(*(der.set_of(*map(_encode_attribute, rdn)) for rdn in self._rdns))
+        self._key: tuple[frozenset[tuple[str, bytes | str]], ...] | None = None
+
+    @classmethod
+    def build(cls, subject: Name | str | Mapping[str, str] | Iterable[tuple[str, str]]) -> Name:
+        """A name from what callers have: `{"C": "CN", "CN": "robot_1"}`, pairs, RFC 4514 text, or a Name.
+
+        Order is kept: the first entry is the one nearest to the root, printed
+        last. In text it is the other way round (RFC 4514, 2.1).
+        InvalidOption: an unknown type, an empty or too long value, a character its string type lacks.
+        """
+        if isinstance(subject, Name):
+            return subject
+        if isinstance(subject, str):
+            return cls.from_rfc4514(subject)
+        pairs = subject.items() if isinstance(subject, Mapping) else subject
+        return cls([(_attribute(kind, text),) for kind, text in pairs])
+
+    @classmethod
+    def from_rfc4514(cls, text: str) -> Name:
+        """The name that `text` spells, as `str` prints it (RFC 4514, 3)."""
+        return cls(reversed(_parse(text))) if text else cls()
+
+    @classmethod
+    def read(cls, reader: der.Reader) -> Name:
+        """Name ::= RDNSequence, X.501, 9.2. CertificateError for a string that is not one."""
+        encoded = reader.raw()
+        outer = der.Reader(encoded)
+        sequence = outer.sequence()
+        rdns: list[tuple[Attribute, ...]] = []
+        while not sequence.at_end():
+            members = sequence.set_of()
+            rdn: list[Attribute] = []
+            while not members.at_end():
+                rdn.append(_read_attribute(members.sequence()))
+            if not rdn:
+                raise CertificateError("a relative distinguished name is empty")
+            rdns.append(tuple(rdn))
+        name = cls.__new__(cls)
+        name._rdns = tuple(rdns)
+        name._der = encoded
+        name._key = None
+        return name
+
+    @property
+    def rdns(self) -> tuple[tuple[Attribute, ...], ...]:
+        return self._rdns
+
+    @property
+    def attributes(self) -> tuple[Attribute, ...]:
+        """All attributes, from the root downwards."""
+        return tuple(attribute for rdn in self._rdns for attribute in rdn)
+
+    def get(self, kind: str) -> str | None:
+        """The text of the last attribute of type `kind` ("CN", or a dotted identifier), None if there is none."""
+        oid, _, _ = _BY_NAME.get(kind.lower(), (kind, 0, 0))
+        return next((a.text for a in reversed(self.attributes) if a.oid == oid), None)
+
+    def to_der(self) -> bytes:
+        return self._der
+
+    def rfc4514(self) -> str:
+        """RFC 4514, 2: the last relative name first; what could mislead a reader is escaped."""
+        return ",".join("+".join(_print_attribute(a) for a in rdn) for rdn in reversed(self._rdns))
+
+    def _comparable(self) -> tuple[frozenset[tuple[str, bytes | str]], ...]:
+        if self._key is None:
+            self._key = tuple(
+                frozenset((a.oid, a.value if a.text is None else _fold(a.text)) for a in rdn) for rdn in self._rdns
+            )
+        return self._key
+
+    def __bool__(self) -> bool:
+        return bool(self._rdns)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Name):
+            return NotImplemented
+        return self._der == other._der or self._comparable() == other._comparable()
+
+    def __hash__(self) -> int:
+        return hash(self._comparable())
+
+    def __str__(self) -> str:
+        return self.rfc4514()
+
+    def __repr__(self) -> str:
+        return f"<Name {self.rfc4514()}>"
+
+
+_ASCII_LOWER: Final = {upper: upper + 32 for upper in range(ord("A"), ord("Z") + 1)}
+
+
+def _fold(text: str) -> str:
+    """RFC 5280, 7.1 by way of OpenSSL: blanks at the ends gone, runs of them one, ASCII letters small."""
+    return " ".join(re.split(r"[ \t\n\v\f\r]+", text.strip(" \t\n\v\f\r"))).translate(_ASCII_LOWER)
+
+
+def _encode_attribute(attribute: Attribute) -> bytes:
+    return der.sequence(der.oid(attribute.oid), attribute.value)
+
+
+def _read_attribute(reader: der.Reader) -> Attribute:
+    oid = reader.oid()
+    value = reader.checked()
+    reader.finish()
+    codec = _CODECS.get(value[0])
+    text = None
+    if codec is not None:
+        content = der.Reader(value).value(value[0])
+        try:
+            text = content.decode(codec)
+        except UnicodeDecodeError:
+            raise CertificateError(f"a name's {_BY_OID.get(oid, oid)} is not {codec} text") from None
+    return Attribute(oid, value, text)
+
+
+def _attribute(kind: str, text: str) -> Attribute:
+    if not isinstance(kind, str) or not isinstance(text, str):
+        raise TypeError("a name's types and values must be str")
+    oid, bound, tag = _BY_NAME.get(kind.lower(), (kind, 32768, der.UTF8_STRING))
+    if not _DOTTED.fullmatch(oid):
+        raise InvalidOption(f"unknown attribute type {kind!r}; a dotted object identifier names any other")
+    if not 1 <= len(text) <= bound or (kind.upper() == "C" and len(text) != 2):
+        limits = "exactly 2" if kind.upper() == "C" else f"1 to {bound}"
+        raise InvalidOption(f"a name's {kind} must have {limits} characters, not {len(text)}")
+    if tag == der.PRINTABLE_STRING and not _PRINTABLE.fullmatch(text):
+        raise InvalidOption(f"a name's {kind} takes letters, digits, blank and '()+,-./:=? only")
+    try:
+        return Attribute(oid, der.element(tag, text.encode(_CODECS[tag])), text)
+    except UnicodeEncodeError:
+        raise InvalidOption(f"a name's {kind} has a character that {_CODECS[tag]} cannot write") from None
+    except InvalidEncoding as error:
+        raise InvalidOption(str(error)) from None
+
+
+# --- RFC 4514 text ---
+
+
+def _print_attribute(attribute: Attribute) -> str:
+    if attribute.text is None or attribute.oid not in _BY_OID:
+        # 2.4: types without a short name, and values that are not strings, as # and the DER in hex.
+        return f"{attribute.type}=#{attribute.value.hex()}"
+    return f"{attribute.type}={_escape(attribute.text)}"
+
+
+def _escape(text: str) -> str:
+    """2.4, and hex pairs for whatever does not print: controls, line ends, bidirectional marks, odd blanks."""
+    out = []
+    for i, c in enumerate(text):
+        edge_blank = c == " " and i in (0, len(text) - 1)
+        if c in _SPECIAL or edge_blank or (c == "#" and i == 0):
+            out.append("\\" + c)
+        elif c.isprintable():
+            out.append(c)
+        else:
+            out.append("".join(f"\\{byte:02x}" for byte in c.encode("utf-8", "surrogatepass")))
+    return "".join(out)
+
+
+_PAIR: Final = re.compile(r'((?:\\[0-9A-Fa-f]{2})+)|\\([ "#+,;<=>\\])|([^\\"+,;<>\x00])', re.DOTALL)
+_KIND: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9-]*|[0-9]+(?:\.[0-9]+)+)\s*=\s*")
+_HEX: Final = re.compile(r"#((?:[0-9A-Fa-f]{2})+)[ ]*")
+
+
+def _parse(text: str) -> list[tuple[Attribute, ...]]:
+    """RFC 4514, 3: the relative names in the order of the text."""
+    rdns: list[tuple[Attribute, ...]] = []
+    rdn: list[Attribute] = []
+    position = 0
+    while True:
+        kind = _KIND.match(text, position)
+        if kind is None:
+            raise InvalidOption(f"not a distinguished name of RFC 4514: expected TYPE= at character {position}")
+        position = kind.end()
+        hexadecimal = _HEX.match(text, position)
+        if hexadecimal is not None:
+            position = hexadecimal.end()
+            rdn.append(_hex_attribute(kind[1], bytes.fromhex(hexadecimal[1])))
+        else:
+            value, position = _parse_value(text, position)
+            rdn.append(_attribute(kind[1], value))
+        separator = text[position : position + 1]
+        position += 1
+        if separator != "+":
+            rdns.append(tuple(rdn))
+            rdn = []
+        if not separator:
+            return rdns
+        if separator not in ",+":
+            raise InvalidOption(f"not a distinguished name of RFC 4514: {separator!r} must be escaped")
+
+
+def _hex_attribute(kind: str, value: bytes) -> Attribute:
+    oid, _, _ = _BY_NAME.get(kind.lower(), (kind, 0, 0))
+    try:
+        return _read_attribute(der.Reader(der.oid(oid) + der.check(value)))
+    except (CertificateError, InvalidEncoding) as error:
+        raise InvalidOption(f"the value after {kind}=# is no attribute value: {error}") from None
+
+
+def _parse_value(text: str, position: int) -> tuple[str, int]:
+    value = ""
+    kept = 0  # characters that may not be trimmed: everything up to the last one that is escaped or not blank
+    while (pair := _PAIR.match(text, position)) is not None:
+        position = pair.end()
+        if pair[1]:
+            try:
+                value += bytes.fromhex(pair[1].replace("\\", "")).decode("utf-8")
+            except UnicodeDecodeError:
+                raise InvalidOption("the escaped bytes of a name are not UTF-8") from None
+        else:
+            value += pair[2] or pair[3]
+        if pair[3] != " ":
+            kept = len(value)
+    return value[:kept], position
