@@ -36,12 +36,16 @@ class CompilerMissing(RuntimeError):
     """Neither a native solc of the right version nor npm with its solc package can be had."""
 
 
+def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True)  # noqa: S603 - fixed programs, no shell
+
+
 def compiler() -> Path:
     """A program that answers py-solc-x as solc VERSION does."""
     import solcx  # type: ignore[import-not-found, import-untyped, unused-ignore]
 
     native = shutil.which("solc")
-    if native and VERSION in subprocess.run([native, "--version"], capture_output=True, text=True).stdout:
+    if native and VERSION in _run([native, "--version"]).stdout:
         return Path(native)
     if any(str(version) == VERSION for version in solcx.get_installed_solc_versions()):
         return Path(solcx.install.get_executable(VERSION))
@@ -51,8 +55,7 @@ def compiler() -> Path:
     module = folder / "node_modules" / "solc"
     if not (module / "soljson.js").exists():
         folder.mkdir(parents=True, exist_ok=True)
-        command = ["npm", "install", "--silent", "--no-save", "--prefix", str(folder), f"solc@{VERSION}"]
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = _run(["npm", "install", "--silent", "--no-save", "--prefix", str(folder), f"solc@{VERSION}"])
         if done.returncode or not (module / "soljson.js").exists():
             raise CompilerMissing(f"npm could not install solc@{VERSION}: {done.stderr.strip()}")
     os.environ["SOLC_JS"] = str(module)

@@ -16,14 +16,17 @@ from rosbridge_eth.ledger.failures import NodeFailure
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A block's header as far as the ledger looks at it. Fees in wei, time in UTC seconds."""
+    """A block's header as far as the ledger looks at it. Time in UTC seconds.
+
+    `base_fee` in wei; None on a network from before London, where gas has one price.
+    """
 
     number: int
     hash: bytes
     parent_hash: bytes
     timestamp: int
     gas_limit: int
-    base_fee: int
+    base_fee: int | None
 
 
 @dataclass(frozen=True, slots=True)

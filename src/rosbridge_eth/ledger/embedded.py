@@ -69,20 +69,20 @@ class EmbeddedChain:
         from eth.chains.base import MiningChain
         from eth.constants import POST_MERGE_DIFFICULTY, POST_MERGE_MIX_HASH, POST_MERGE_NONCE
         from eth.db.atomic import AtomicDB
-        from eth.vm.forks import PragueVM
+        from eth.vm.forks.prague import PragueVM
         from eth_keys.datatypes import PrivateKey
         from eth_utils.address import to_canonical_address
 
-        chain_class = MiningChain.configure(
+        chain_class: Any = MiningChain.configure(
             __name__="EmbeddedChain", vm_configuration=((0, PragueVM),), chain_id=CHAIN_ID
         )
         self._faucet = PrivateKey(_FAUCET_KEY)
         wealth = {self._faucet.public_key.to_canonical_address(): _FAUCET_WEI}
         wealth.update({to_canonical_address(address): wei for address, wei in (fund or {}).items()})
-        state = {
+        state: Any = {
             address: {"balance": wei, "nonce": 0, "code": b"", "storage": {}} for address, wei in wealth.items()
         }
-        genesis = {
+        genesis: Any = {
             "coinbase": _NO_ACCOUNT,
             "difficulty": POST_MERGE_DIFFICULTY,
             "extra_data": b"",
@@ -182,7 +182,7 @@ class EmbeddedChain:
                 chain_id=CHAIN_ID,
                 nonce=nonce,
                 max_priority_fee_per_gas=PRIORITY_FEE,
-                max_fee_per_gas=PRIORITY_FEE + 2 * self.head().base_fee,
+                max_fee_per_gas=PRIORITY_FEE + 2 * self._blocks[-1].header.base_fee_per_gas,
                 gas=100_000,
                 to=_canonical(address),
                 value=wei,
@@ -283,19 +283,19 @@ class EmbeddedChain:
             except ValidationError as error:
                 raise InsufficientFunds(f"insufficient funds: {error}") from error
         if computation.is_error:
-            error = computation.error
-            if isinstance(error, Revert):
-                data = bytes(error.args[0]) if error.args and isinstance(error.args[0], bytes) else b""
+            fault = computation.error
+            if isinstance(fault, Revert):
+                data = bytes(fault.args[0]) if fault.args and isinstance(fault.args[0], bytes) else b""
                 raise Reverted("execution reverted", data)
-            if isinstance(error, VMError):
-                raise GasRefused(f"execution failed: {type(error).__name__}")
-            raise error
+            if isinstance(fault, VMError):
+                raise GasRefused(f"execution failed: {type(fault).__name__}")
+            raise fault
         return spoofed, computation
 
     def _accept(self, raw: bytes) -> bytes:
-        import rlp
         from eth.exceptions import UnrecognizedTransactionType
         from eth_utils.exceptions import ValidationError
+        from rlp.exceptions import RLPException  # type: ignore[import-untyped]
 
         if len(raw) > MAX_TRANSACTION_SIZE:
             raise TooLarge(f"oversized data: transaction size {len(raw)}, limit {MAX_TRANSACTION_SIZE}")
@@ -305,7 +305,7 @@ class EmbeddedChain:
             sender = tx.sender
             if tx.chain_id != CHAIN_ID:
                 raise Refused(f"invalid chain id: {tx.chain_id} instead of {CHAIN_ID}")
-        except (rlp.exceptions.RLPException, ValidationError, UnrecognizedTransactionType, TypeError) as error:
+        except (RLPException, ValidationError, UnrecognizedTransactionType, TypeError) as error:
             raise Refused(f"not a transaction of this chain: {error}") from error
         tx_hash = bytes(tx.hash)
         queue = self._pool.setdefault(sender, {})

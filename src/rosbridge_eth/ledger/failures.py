@@ -117,8 +117,14 @@ _TABLE: tuple[tuple[type[NodeFailure], str], ...] = (
         r"underpriced|fee too low|feetoolow|max fee per gas less than block base fee|gas price too low|"
         r"gas price below|max priority fee per gas higher than max fee|replacementnotallowed|tip .*too low",
     ),
-    (InsufficientFunds, r"insufficient funds|insufficientfunds|upfront cost exceeds|insufficient balance|not enough funds"),
-    (TooLarge, r"oversized data|transaction too large|rlp too long|request entity too large|body too large|init ?code size"),
+    (
+        InsufficientFunds,
+        r"insufficient funds|insufficientfunds|upfront cost exceeds|insufficient balance|not enough funds",
+    ),
+    (
+        TooLarge,
+        r"oversized data|transaction too large|rlp too long|request entity too large|body too large|init ?code size",
+    ),
     (
         GasRefused,
         r"intrinsic gas|exceeds block gas limit|gas limit reached|gas limit too (high|low)|gaslimitexceeded|"

@@ -226,15 +226,15 @@ class _Reading:
         lost_at = 0  # where a link led to no event; from there on downwards every block is looked at
         while block >= max(from_block, 1) and number > 0:
             first, events = self._events("Batch", max(from_block, block - SPAN + 1, 1), block)
-            below = first - 1
+            below, found = first - 1, False
             for event in events:
                 if not isinstance(event, BatchRecorded) or event.number > number:
                     continue  # seen already
                 if event.number < number:
                     self._withheld(lost_at or event.log.block_number, event.number + 1, number)
                 yield event
-                number, below, lost_at = event.number - 1, event.previous_block, 0
-            if below == first - 1:
+                number, below, found, lost_at = event.number - 1, event.previous_block, True, 0
+            if not found:
                 lost_at = lost_at or block
             block = below
         if number > 0 and (lost_at or from_block <= 1):
@@ -242,7 +242,8 @@ class _Reading:
 
     def _withheld(self, block: int, first: int, last: int) -> None:
         which = f"batch number {first}" if first == last else f"batches number {first} to {last}"
-        self._problem(ProblemKind.MISSING_BATCH, block, f"{which} of the robot: the contract counts it, no event shows it")
+        detail = f"{which} of the robot: counted by the contract, shown by no event"
+        self._problem(ProblemKind.MISSING_BATCH, block, detail)
 
     def _records(self, event: BatchRecorded) -> list[ChainRecord]:
         log, index = event.log, event.batch_index
