@@ -30,7 +30,11 @@ from smcrypto.errors import (
 )
 
 if TYPE_CHECKING:
-    from smcrypto import kdf, sm2, sm3, sm4, x509
+    from . import kdf as kdf
+    from . import sm2 as sm2
+    from . import sm3 as sm3
+    from . import sm4 as sm4
+    from . import x509 as x509
 
 __version__ = "0.1.0"
 

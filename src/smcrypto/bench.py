@@ -71,11 +71,8 @@ def comparisons(found: Sequence[Timing]) -> list[Comparison]:
 
 def duration(seconds: float) -> str:
     """Three significant digits with the unit that suits: '85.1 µs', '3.40 s'."""
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= scale:
-            break
-    else:
-        unit, scale = "ns", 1e-9
+    units = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
+    unit, scale = next((entry for entry in units if seconds >= entry[1]), units[-1])
     value = seconds / scale
     return f"{value:.0f} {unit}" if value >= 100 else f"{value:.3g} {unit}"
 

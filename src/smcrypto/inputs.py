@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from smcrypto.errors import InvalidLength
 
-# collections.abc.Buffer exists from Python 3.12; at run time any object with the buffer protocol is taken.
-BytesLike: TypeAlias = bytes | bytearray | memoryview
+if TYPE_CHECKING:
+    # collections.abc.Buffer exists from Python 3.12 only; type checkers know it by this name in every version.
+    from typing_extensions import Buffer
+
+    BytesLike: TypeAlias = Buffer
+else:
+    BytesLike = bytes | bytearray | memoryview
 
 __all__ = ["BytesLike", "as_bytes", "as_exact_bytes"]
 

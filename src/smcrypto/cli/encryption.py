@@ -13,15 +13,16 @@ import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from smcrypto import kdf, sm2, sm4
+from smcrypto import kdf, sm4
 from smcrypto.cli import passwords
 from smcrypto.cli.files import add_input, add_output, chunks, read_all, write_output
 from smcrypto.cli.keys import load_private, load_public
 from smcrypto.errors import InvalidCiphertext, InvalidOption
+from smcrypto.sm4.modes import Mode
 
 __all__ = ["add_parser"]
 
-MODES: dict[str, Callable[[bytes], sm4.Mode]] = {
+MODES: dict[str, Callable[[bytes], Mode]] = {
     "cbc": sm4.CBC, "ctr": sm4.CTR, "cfb": sm4.CFB, "ofb": sm4.OFB,
 }
 MAGIC = b"Salted__"
@@ -74,7 +75,7 @@ def _from_password(password: bytes, salt: bytes, options: argparse.Namespace) ->
     return derived[:16], derived[16:]
 
 
-def _streamed(context: sm4.CipherContext, pieces: Iterator[bytes]) -> Iterator[bytes]:
+def _streamed(context: sm4.CipherStream, pieces: Iterator[bytes]) -> Iterator[bytes]:
     for piece in pieces:
         yield context.update(piece)
     yield context.finalize()
