@@ -1,0 +1,224 @@
+"""From a TOML file to a checked configuration, or to a sentence that says what to change.
+
+Every problem of a file is told at once, each with line, key, what was given and
+what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import stat
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from rosbridge_eth.config.models import SOURCE_KINDS, ReaderConfig, RobotConfig, Section, ServerConfig
+from rosbridge_eth.errors import ConfigError, IdentityError
+
+_Config = TypeVar("_Config", bound=Section)
+MAX_FILE = 1 << 20
+MAX_PROBLEMS = 8
+
+
+def load_robot_config(path: Path) -> RobotConfig:
+    """robot.toml. Raises ConfigError."""
+    return parse_config(RobotConfig, _read(path, 'topics = ["/robot_1/odom"]'), path)
+
+
+def load_server_config(path: Path) -> ServerConfig:
+    """server.toml. Raises ConfigError."""
+    return parse_config(ServerConfig, _read(path, 'listen = "0.0.0.0:7410"'), path)
+
+
+def load_reader_config(path: Path) -> ReaderConfig:
+    """reader.toml. Raises ConfigError."""
+    return parse_config(ReaderConfig, _read(path, 'contract = "0x..."'), path)
+
+
+def parse_config(model: type[_Config], text: str, file: Path) -> _Config:
+    """The configuration in `text`; `file` is named in errors, and relative paths start at its folder."""
+    try:
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{file} is not TOML: {_decapitalised(str(error))}") from None
+    try:
+        return model.model_validate(values, context={"folder": file.parent})
+    except ValidationError as error:
+        problems = [_problem(model, detail, text) for detail in error.errors(include_url=False)]
+        shown = "; ".join(problems[:MAX_PROBLEMS])
+        more = f"; and {len(problems) - MAX_PROBLEMS} more" if len(problems) > MAX_PROBLEMS else ""
+        raise ConfigError(f"{file}: {shown}{more}") from None
+
+
+def require_file(path: Path, what: str) -> Path:
+    """`path` if it is a file; else ConfigError. `what`: "CA certificate" or the like."""
+    if not path.is_file():
+        raise ConfigError(f"{what} {path} " + ("is a folder; name a file" if path.is_dir() else "does not exist"))
+    return path
+
+
+def require_private(path: Path) -> Path:
+    """`path` if nobody but its owner can read or write it; else IdentityError."""
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except FileNotFoundError:
+        raise IdentityError(f"key file {path} does not exist") from None
+    except OSError as error:
+        raise IdentityError(f"key file {path} cannot be read: {error.strerror}") from error
+    if mode & 0o077:
+        raise IdentityError(
+            f"key file {path} is open to others (mode {mode:04o}); run `chmod 600 {path}`, "
+            "and if it may have been read, register anew"
+        )
+    return path
+
+
+def _read(path: Path, example: str) -> str:
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE:
+            raise ConfigError(f"{path} has {size} bytes; a configuration has at most {MAX_FILE}")
+        return path.read_bytes().decode()
+    except FileNotFoundError:
+        raise ConfigError(f"{path} does not exist; create it, for instance with the line {example}") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path} is a folder; name the file") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 (byte {error.start})") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+
+
+# Sentences
+
+_EXPECTED = {
+    "string_type": "a string in quotes",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "bool_type": "true or false",
+    "list_type": "a list in [ ]",
+    "dict_type": "a table",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "int_from_float": "a whole number",
+    "finite_number": "a finite number",
+}
+_BOUNDS = {
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
+    location = _without_tags(detail["loc"])
+    key = _key(location)
+    kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
+    if kind == "extra_forbidden":
+        name = str(location[-1])
+        table = _key(location[:-1])
+        allowed = _allowed_keys(model, location[:-1])
+        near = difflib.get_close_matches(name, allowed, 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(allowed)}"
+        where = f" in {table}" if table else ""
+        sentence = f"unknown key {name!r}{where}; {hint}"
+    elif kind == "missing":
+        sentence = f"{key} is missing"
+    elif kind == "literal_error":
+        allowed = [part.strip() for part in re.split(r",| or ", str(context["expected"]))]
+        near = difflib.get_close_matches(repr(given), allowed, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        sentence = f"{key} is {_shown(given)}; allowed: {', '.join(allowed)}{hint}"
+    elif kind in _EXPECTED:
+        sentence = f"{key} is {_shown(given)}; it should be {_EXPECTED[kind]}"
+    elif kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        sentence = f"{key} is {_shown(given)}; it should be {words} {context[name]}"
+    elif kind == "too_short":
+        sentence = f"{key} is empty"
+    elif kind == "value_error":
+        # A validator of ours: its text continues a sentence that begins with the key, or stands for itself.
+        words = str(context["error"])
+        sentence = f"{key or 'it'} {words}" if re.match(r"(is|has|names|ends) ", words) else f"{key}: {words}"
+    else:
+        sentence = f"{key} is {_shown(given)}; {_decapitalised(detail['msg'])}"
+    line = _line(text, location)
+    return f"line {line}: {sentence}" if line and location else sentence
+
+
+def _without_tags(location: Sequence[str | int]) -> tuple[str | int, ...]:
+    """The path of keys; pydantic puts the kind of a source between `source` and its keys."""
+    if len(location) > 1 and location[0] == "source" and location[1] in SOURCE_KINDS:
+        return (location[0], *location[2:])
+    return tuple(location)
+
+
+def _key(location: Sequence[str | int]) -> str:
+    """`topics[1].rate`."""
+    words = ""
+    for part in location:
+        words += f"[{part}]" if isinstance(part, int) else f".{part}" if words else part
+    return words
+
+
+def _allowed_keys(model: type[Section], location: Sequence[str | int]) -> list[str]:
+    """The keys of the table at `location`, walking the models' annotations."""
+    tables: list[type[BaseModel]] = [model]
+    for part in location:
+        if isinstance(part, str):
+            annotations = [
+                field.annotation
+                for table in tables
+                for name, field in table.model_fields.items()
+                if part in (field.alias, name)
+            ]
+            tables = [table for annotation in annotations for table in _models_in(annotation)]
+    return sorted({field.alias or name for table in tables for name, field in table.model_fields.items()})
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for argument in get_args(annotation) for model in _models_in(argument)]
+
+
+def _line(text: str, location: Sequence[str | int]) -> int | None:
+    """The line on which the key at `location` is set, or of the nearest table or key around it that is found."""
+    lines: dict[tuple[str | int, ...], int] = {}
+    table: tuple[str | int, ...] = ()
+    counts: dict[tuple[str | int, ...], int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*(\[\[?)\s*([A-Za-z0-9_\-.\s]+?)\s*\]", line):
+            name = tuple(part.strip() for part in header[2].split("."))
+            table = (*name, counts.setdefault(name, 0)) if header[1] == "[[" else name
+            if header[1] == "[[":
+                counts[name] += 1
+            lines.setdefault(table, number)
+            lines.setdefault(name, number)
+        elif setting := re.match(r"\s*([A-Za-z0-9_\-]+(?:\s*\.\s*[A-Za-z0-9_\-]+)*)\s*=", line):
+            keys = tuple(part.strip() for part in setting[1].split("."))
+            for end in range(1, len(keys) + 1):
+                lines.setdefault((*table, *keys[:end]), number)
+    for end in range(len(location), 0, -1):
+        if tuple(location[:end]) in lines:
+            return lines[tuple(location[:end])]
+    return None
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Mapping):
+        return "a table"
+    words = repr(value)
+    return words if len(words) <= 60 else words[:57] + "..."
+
+
+def _decapitalised(sentence: str) -> str:
+    return sentence[:1].lower() + sentence[1:]

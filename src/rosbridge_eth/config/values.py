@@ -1,0 +1,104 @@
+"""Durations, times, sizes and addresses as a person writes them in TOML.
+
+    duration   "250ms"  "2s"  "5m"  "1h30m"  "24h"  "7d"
+    time       "2026-11-21T10:00:00Z", quoted or not (RFC 3339; the offset is required)
+    size       "64 MiB"  "500 kB"  or a number of bytes
+    address    "192.0.2.7:7410"  "robots.example:7410"  "[2001:db8::7]:7410"
+
+Each parser takes the value TOML gave and raises ValueError with the rest of a
+sentence that begins with the key.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BeforeValidator, ValidationInfo
+
+_UNITS_NS = {"ms": 10**6, "s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9, "d": 86400 * 10**9}
+_PART = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?(ms|s|m|h|d)", re.ASCII)
+_DURATION = re.compile(rf"{_PART.pattern}(?: ?{_PART.pattern})*", re.ASCII)
+_SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+_SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
+_HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]{1,253}):(\d{1,5})", re.ASCII)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def parse_duration(value: Any) -> int:
+    """Nanoseconds."""
+    if not isinstance(value, str) or not _DURATION.fullmatch(value):
+        raise ValueError(f'is {value!r}; write a duration with its unit, such as "250ms", "2s", "5m", "1h30m", "7d"')
+    total = sum(float(number) * _UNITS_NS[unit] for number, unit in _PART.findall(value))
+    if not total:
+        raise ValueError(f"is {value!r}; it has to be longer than nothing")
+    return round(total)
+
+
+def parse_seconds(value: Any) -> float:
+    """As parse_duration, in seconds."""
+    return parse_duration(value) / 1e9
+
+
+def parse_time(value: Any) -> int:
+    """Nanoseconds since 1970."""
+    moment = value
+    if isinstance(value, str):
+        try:
+            moment = datetime.fromisoformat(value)
+        except ValueError:
+            moment = None
+    if not isinstance(moment, datetime):
+        raise ValueError(f'is {str(value)!r}; write a time such as "2026-11-21T10:00:00Z"')
+    if moment.tzinfo is None:
+        raise ValueError(f'is {str(value)!r}; say in which time zone: end it with "Z" or an offset such as "+08:00"')
+    passed = moment - _EPOCH
+    return (passed.days * 86400 + passed.seconds) * 10**9 + passed.microseconds * 1000
+
+
+def parse_size(value: Any) -> int:
+    """Bytes."""
+    if isinstance(value, int) and not isinstance(value, bool) and value > 0:
+        return value
+    match = _SIZE.fullmatch(value) if isinstance(value, str) else None
+    size = round(float(match[1]) * _SIZES[match[2]]) if match else 0
+    if size < 1:
+        raise ValueError(f'is {value!r}; write a size such as "64 MiB", "500 kB" or a number of bytes')
+    return size
+
+
+class Address(NamedTuple):
+    """Where a socket listens or connects to. `host` has no brackets."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def parse_address(value: Any) -> Address:
+    """Host and port; port 0 lets the system choose."""
+    match = _HOST_PORT.fullmatch(value) if isinstance(value, str) else None
+    if match is None or int(match[2]) > 65535:
+        raise ValueError(f'is {value!r}; write HOST:PORT, such as "192.0.2.7:7410" or "[2001:db8::7]:7410"')
+    return Address(match[1].strip("[]"), int(match[2]))
+
+
+def parse_path(value: Any, info: ValidationInfo) -> Path:
+    """A path; a relative one starts at the folder of the configuration file."""
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"is {value!r}; write a path in quotes")
+    folder = info.context.get("folder") if info.context else None
+    path = Path(value).expanduser()
+    return folder / path if isinstance(folder, Path) else path
+
+
+DurationNs = Annotated[int, BeforeValidator(parse_duration)]
+Seconds = Annotated[float, BeforeValidator(parse_seconds)]
+TimeNs = Annotated[int, BeforeValidator(parse_time)]
+Size = Annotated[int, BeforeValidator(parse_size)]
+HostPort = Annotated[Address, BeforeValidator(parse_address)]
+FilePath = Annotated[Path, BeforeValidator(parse_path)]
