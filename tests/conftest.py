@@ -1,0 +1,38 @@
+"""What the tests share: services that may be absent, and hypothesis profiles.
+
+A test that needs a program skips, with the reason, where it is not installed;
+with REQUIRE_SERVICES=1, as in CI, that is a failure.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("default", deadline=None, max_examples=100)
+settings.register_profile("thorough", deadline=None, max_examples=5000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def unavailable(reason: str) -> None:
+    """Skip the test for this reason, or fail where services are required."""
+    if os.environ.get("REQUIRE_SERVICES") == "1":
+        pytest.fail(f"REQUIRE_SERVICES=1, but {reason}")
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def require() -> Callable[[str], str]:
+    """`require("openssl")` gives the program's path, or skips."""
+
+    def find(program: str) -> str:
+        path = shutil.which(program)
+        if path is None:
+            unavailable(f"the program {program!r} is not installed")
+        return str(path)
+
+    return find
