@@ -1,4 +1,4 @@
-"""X.509 with SM2-with-SM3: certificates, requests, chains (RFC 5280, GM/T 0015, RFC 8998).
+"""X.509 with SM2-with-SM3: certificates, requests, chains, revocation (RFC 5280, GM/T 0015, RFC 8998).
 
 `verify_chain` says whether a certificate is to be trusted; everything else
 only reads and writes. Reading is strict DER; a signature covers the bytes
@@ -17,6 +17,7 @@ from smcrypto.x509.issuing import (
 )
 from smcrypto.x509.names import Attribute, Name
 from smcrypto.x509.request import CertificateSigningRequest, RequestAttribute
+from smcrypto.x509.revocation import CertificateRevocationList, RevokedCertificate
 from smcrypto.x509.signed import CertificateSignatureError
 
 __all__ = [
@@ -27,11 +28,13 @@ __all__ = [
     "AuthorityKeyIdentifier",
     "BasicConstraints",
     "Certificate",
+    "CertificateRevocationList",
     "CertificateSignatureError",
     "CertificateSigningRequest",
     "Extension",
     "Name",
     "RequestAttribute",
+    "RevokedCertificate",
     "issue",
     "load_pem_certificates",
     "self_signed",

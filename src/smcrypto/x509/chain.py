@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from datetime import datetime
-from typing import Final
+from typing import Final, Literal
 
 from smcrypto import sm2
-from smcrypto.errors import CertificateError
+from smcrypto.errors import CertificateError, InvalidOption
 from smcrypto.inputs import BytesLike, as_bytes
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
+from smcrypto.x509.revocation import CertificateRevocationList, check_revocation
 from smcrypto.x509.signed import instant
 
 __all__ = ["MAX_PATH", "verify_chain"]
@@ -51,17 +52,31 @@ def verify_chain(
     uid: BytesLike = sm2.DEFAULT_UID,
     extended_key_usage: str | Iterable[str] | None = None,
     key_usage: str | Iterable[str] | None = None,
+    crls: Iterable[CertificateRevocationList] = (),
+    revocation: Literal["leaf", "every"] = "leaf",
 ) -> tuple[Certificate, ...]:
     """The path from `leaf` to one of `roots`, both included; CertificateError, saying why, if there is none.
 
     at: the moment, aware. uid: of every signature in the path.
     extended_key_usage: purposes that the leaf, and every CA that restricts them, must allow.
     key_usage: usages that the leaf must allow. Certificates without these extensions allow everything.
+    crls: where any are given, the leaf must be covered by a fresh one of its issuer, CAs are checked against
+    those there are, and with `revocation="every"` each certificate below the root must be covered.
     """
+    if revocation not in ("leaf", "every"):
+        raise InvalidOption(f"revocation must be 'leaf' or 'every', not {revocation!r}")
     for certificate in (leaf, *(intermediates := tuple(intermediates)), *(roots := tuple(roots))):
         if not isinstance(certificate, Certificate):
             raise TypeError(f"a Certificate is needed, not {type(certificate).__name__}")
-    search = _Search(intermediates, roots, instant(at, "at"), as_bytes(uid, "uid"), _names(extended_key_usage))
+    search = _Search(
+        intermediates,
+        roots,
+        instant(at, "at"),
+        as_bytes(uid, "uid"),
+        _names(extended_key_usage),
+        tuple(crls),
+        revocation == "every",
+    )
     usages = ext.usage_names(_names(key_usage))
     if leaf.key_usage is not None and not usages <= leaf.key_usage:
         raise CertificateError(f"{leaf.subject} may not be used for {', '.join(sorted(usages - leaf.key_usage))}")
@@ -84,12 +99,16 @@ class _Search:
         at: datetime,
         uid: bytes,
         purposes: tuple[str, ...],
+        crls: tuple[CertificateRevocationList, ...],
+        every: bool,
     ) -> None:
         self.roots = frozenset(roots)
         self.candidates = tuple(dict.fromkeys(roots + intermediates))
         self.at = at
         self.uid = uid
         self.purposes = frozenset(map(ext.purpose_name, purposes))
+        self.crls = crls
+        self.every = every
         self.steps = 0
         self.signatures: dict[tuple[Certificate, Certificate], CertificateError | None] = {}
         self.refusal: tuple[int, CertificateError] | None = None
@@ -106,7 +125,7 @@ class _Search:
     def extend(self, path: tuple[Certificate, ...]) -> tuple[Certificate, ...] | None:
         current = path[-1]
         if current in self.roots:
-            return path
+            return self.unrevoked(path)
         if len(path) >= MAX_PATH:
             self.refused(path, CertificateError(f"the path is longer than {MAX_PATH} certificates"))
             return None
@@ -132,6 +151,16 @@ class _Search:
             trusted = "trusted root" if current.subject == current.issuer else "known issuer"
             self.refused(path, CertificateError(f"no {trusted} {current.issuer} for {current.subject}"))
         return None
+
+    def unrevoked(self, path: tuple[Certificate, ...]) -> tuple[Certificate, ...] | None:
+        """The path, unless a revocation list of one of its issuers speaks against it: 6.3."""
+        if self.crls or self.every:
+            try:
+                check_revocation(path, self.crls, self.at, self.uid, every=self.every)
+            except CertificateError as error:
+                self.refused(path, error)
+                return None
+        return path
 
     def refused(self, path: tuple[Certificate, ...], error: CertificateError) -> None:
         if self.refusal is None or len(path) > self.refusal[0]:
