@@ -1,0 +1,54 @@
+"""The secure channel between robot and server, over UDP, without a socket in it: docs/channel.md.
+
+`Client` and `Server` take datagrams and the time, and give datagrams, events
+and the next time. `channel.udp` puts sockets under them, `channel.simulation`
+a network that loses, doubles, delays, reorders, corrupts and rebinds by seed.
+"""
+
+from rosbridge_eth.channel.admission import Address
+from rosbridge_eth.channel.client import Client
+from rosbridge_eth.channel.events import (
+    AddressChanged,
+    ChannelConfig,
+    ClientConfig,
+    Connected,
+    Disconnected,
+    Drop,
+    End,
+    Event,
+    Full,
+    HandshakeFailed,
+    MessageAnswered,
+    MessageReceived,
+    NotConnected,
+    ServerConfig,
+    Statistics,
+)
+from rosbridge_eth.channel.handshake import Randomness
+from rosbridge_eth.channel.server import Server, cookie_key
+from rosbridge_eth.channel.wire import Mode, Reason
+
+__all__ = [
+    "Address",
+    "AddressChanged",
+    "ChannelConfig",
+    "Client",
+    "ClientConfig",
+    "Connected",
+    "Disconnected",
+    "Drop",
+    "End",
+    "Event",
+    "Full",
+    "HandshakeFailed",
+    "MessageAnswered",
+    "MessageReceived",
+    "Mode",
+    "NotConnected",
+    "Randomness",
+    "Reason",
+    "Server",
+    "ServerConfig",
+    "Statistics",
+    "cookie_key",
+]

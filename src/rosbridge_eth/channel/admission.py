@@ -1,0 +1,128 @@
+"""What a server does before it trusts a datagram: cookies, reset tokens, and limits on what strangers cost it.
+
+A hostile HELLO costs one keyed hash and leaves no trace. A PROOF costs
+signatures, so it is admitted by its source (an address that proved, with a
+cookie, that it can receive) and by the share of time that handshakes may take.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections import OrderedDict
+from hashlib import blake2s
+from ipaddress import IPv4Address, ip_address
+
+from rosbridge_eth.channel.wire import COOKIE_SIZE, RESET_TOKEN_SIZE, Mode
+
+__all__ = ["Address", "Cookies", "Sources", "TokenBucket"]
+
+Address = tuple[str, int]
+"""Host and port. More that a socket may add (flow label, scope) is kept out of it by the shell."""
+
+
+class Cookies:
+    """Cookies and reset tokens under one 32-byte key, shared by the processes of a server.
+
+    A cookie is the time (8 bytes, ms) and a keyed hash of it, the address, and
+    the HELLO's fields. A reset token is a keyed hash of a connection id.
+    """
+
+    __slots__ = ("_cookie_key", "_reset_key", "lifetime")
+
+    def __init__(self, key: bytes, lifetime: float) -> None:
+        if len(key) != 32:
+            raise ValueError(f"the cookie key must be 32 bytes, not {len(key)}")
+        self._cookie_key = blake2s(b"cookie", key=key).digest()
+        self._reset_key = blake2s(b"reset", key=key).digest()
+        self.lifetime = lifetime
+
+    def _hash(self, stamp: bytes, address: Address, mode: Mode, cid: bytes, nonce: bytes) -> bytes:
+        place = f"{address[0]} {address[1]}".encode()
+        return blake2s(
+            stamp + bytes((mode,)) + cid + nonce + place, key=self._cookie_key, digest_size=COOKIE_SIZE - 8
+        ).digest()
+
+    def make(self, address: Address, mode: Mode, cid: bytes, nonce: bytes, now: float) -> bytes:
+        stamp = int(now * 1000).to_bytes(8, "big")
+        return stamp + self._hash(stamp, address, mode, cid, nonce)
+
+    def holds(
+        self, cookie: bytes, address: Address, mode: Mode, cid: bytes, nonce: bytes, now: float
+    ) -> bool:
+        stamp = cookie[:8]
+        age = now - int.from_bytes(stamp, "big") / 1000
+        if not -0.001 <= age <= self.lifetime:
+            return False
+        return hmac.compare_digest(cookie[8:], self._hash(stamp, address, mode, cid, nonce))
+
+    def reset_token(self, cid: bytes) -> bytes:
+        return blake2s(cid, key=self._reset_key, digest_size=RESET_TOKEN_SIZE).digest()
+
+
+class TokenBucket:
+    """`rate` tokens a second, at most `burst` saved up. May be charged below zero, and then waits longer."""
+
+    __slots__ = ("_at", "burst", "level", "rate")
+
+    def __init__(self, rate: float, burst: float, now: float) -> None:
+        self.rate = rate
+        self.burst = burst
+        self.level = burst
+        self._at = now
+
+    def available(self, now: float) -> float:
+        if now > self._at:
+            self.level = min(self.burst, self.level + (now - self._at) * self.rate)
+            self._at = now
+        return self.level
+
+    def charge(self, amount: float) -> None:
+        self.level = min(self.burst, self.level - amount)
+
+
+class Sources:
+    """A token bucket per source: an IPv4 address or an IPv6 /64, the `capacity` most recent ones.
+
+    A handshake that succeeds gives its token back, so many honest robots
+    behind one address are not slowed down; what fails is.
+    """
+
+    __slots__ = ("_buckets", "burst", "capacity", "rate")
+
+    def __init__(self, rate: float, burst: float, capacity: int) -> None:
+        self.rate = rate
+        self.burst = burst
+        self.capacity = capacity
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._buckets)
+
+    @staticmethod
+    def _source(address: Address) -> str:
+        try:
+            ip = ip_address(address[0].partition("%")[0])
+        except ValueError:
+            return address[0]
+        if isinstance(ip, IPv4Address):
+            return str(ip)
+        return str(ip.ipv4_mapped) if ip.ipv4_mapped else ip.exploded[:19]
+
+    def take(self, address: Address, now: float) -> bool:
+        """One token for a handshake from `address`; False if there is none."""
+        source = self._source(address)
+        bucket = self._buckets.get(source)
+        if bucket is None:
+            bucket = self._buckets[source] = TokenBucket(self.rate, self.burst, now)
+            if len(self._buckets) > self.capacity:
+                self._buckets.popitem(last=False)
+        self._buckets.move_to_end(source)
+        if bucket.available(now) < 1:
+            return False
+        bucket.charge(1)
+        return True
+
+    def give_back(self, address: Address) -> None:
+        bucket = self._buckets.get(self._source(address))
+        if bucket is not None:
+            bucket.charge(-1)

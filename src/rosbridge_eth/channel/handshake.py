@@ -1,0 +1,337 @@
+"""The handshake's contents: what is signed, what is agreed on, what is confirmed. No clock, no socket, no state.
+
+    client                                                         server
+    HELLO    mode, cid_c, N, zeros up to 1,200          ─────────▶  (keeps nothing)
+             cookie                                     ◀─────────  COOKIE
+    PROOF    the same, cookie, certificates, R_A,
+             signature over H1                          ─────────▶  half open
+             N_s, cid_s, certificates, R_B or C,
+             signature over H2, S_B, finished over H3   ◀─────────  OFFER
+    FINISHED S_A, finished over H4 (first DATA frame)   ─────────▶  session
+
+Mode `exchange`: SM2 key exchange, GB/T 32918.3-2016, 6.1, client A, server B,
+ephemeral points R_A and R_B, confirmations S_B and S_A; ID = role ‖ SM3 of the
+encryption certificate. K is 32 bytes. Forward secret.
+
+Mode `transport`: the server draws K (32 bytes) and sends C, K encrypted by SM2
+to the client's encryption certificate (GB/T 32918.4); the client verifies the
+server's signature before it decrypts. Not forward secret: who obtains the
+client's encryption key later opens what was recorded.
+
+Transcript hashes are SM3 over everything sent so far, from the HELLO on:
+H1 up to R_A, H2 up to R_B or C, H3 up to S_B, H4 all of it. Session keys come
+from K and H3 (protection), so they agree only if every byte did.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import datetime
+
+from rosbridge_eth.channel.events import Drop
+from rosbridge_eth.channel.protection import SessionSecrets, finished
+from rosbridge_eth.channel.wire import (
+    CID_SIZE,
+    NONCE_SIZE,
+    VERSION,
+    Hello,
+    Malformed,
+    Mode,
+    Reason,
+    fields,
+    parse_fields,
+)
+from rosbridge_eth.identity import (
+    ExpiredCertificate,
+    Identity,
+    NotAllowed,
+    PeerIdentity,
+    Role,
+    Trust,
+    UntrustedCertificate,
+    sign,
+    verify,
+)
+from smcrypto import SMCryptoError, sm2, sm3
+
+__all__ = ["ClientHandshake", "HandshakeRefused", "Randomness", "ServerHandshake", "VerifiedCertificates"]
+
+SHARED_SIZE = 32
+POINT_SIZE = 65
+CONFIRMATION_SIZE = 32
+NO_CONFIRMATION = bytes(CONFIRMATION_SIZE)
+"""S_A in mode `transport`, which has none."""
+
+
+class HandshakeRefused(Exception):
+    """The peer's handshake message is not accepted; `hint` is what it may be told."""
+
+    def __init__(self, drop: Drop, why: str, hint: Reason | None = None) -> None:
+        super().__init__(why)
+        self.drop = drop
+        self.hint = hint
+
+
+@dataclass(frozen=True, slots=True)
+class Randomness:
+    """Where nonces, ids and ephemeral keys come from; another source is for vectors and simulations only."""
+
+    bytes: Callable[[int], bytes] = secrets.token_bytes
+    private_key: Callable[[], sm2.PrivateKey] = field(default=sm2.PrivateKey.generate)
+
+
+class VerifiedCertificates:
+    """Pairs of certificates whose chains were verified, so that a peer who comes again costs less.
+
+    Only what was found good is kept, at most `capacity` pairs, for `recheck`
+    seconds. Validity, role, name and allow list are looked at every time.
+    """
+
+    __slots__ = ("_known", "_trust", "capacity", "recheck")
+
+    def __init__(self, trust: Trust, *, capacity: int, recheck: float) -> None:
+        self._trust = trust
+        self.capacity = capacity
+        self.recheck = recheck
+        self._known: OrderedDict[tuple[bytes, bytes], tuple[float, PeerIdentity]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def check(
+        self,
+        signing: bytes,
+        encryption: bytes,
+        *,
+        role: Role | Iterable[Role],
+        name: str | None,
+        at: datetime,
+        now: float,
+    ) -> PeerIdentity:
+        """As Trust.check; `now` is the monotonic clock."""
+        pair = (signing, encryption)
+        entry = self._known.get(pair)
+        if entry is None or now - entry[0] > self.recheck:
+            entry = (now, self._trust.examine(signing, encryption, at=at))
+            self._known[pair] = entry
+            if len(self._known) > self.capacity:
+                self._known.popitem(last=False)
+        self._known.move_to_end(pair)
+        self._trust.permit(entry[1], role=role, name=name, at=at)
+        return entry[1]
+
+
+def exchange_id(role: Role, encryption_certificate: bytes) -> bytes:
+    """ID of GB/T 32918.3 for one end: its role's name ‖ SM3 of its encryption certificate (DER)."""
+    return role.value.encode("ascii") + sm3.digest(encryption_certificate)
+
+
+def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
+    return sm3.SM3(
+        b"rosbridge-eth/1 handshake\0"
+        + bytes((VERSION, hello.mode))
+        + hello.client_cid
+        + hello.nonce
+        + cookie
+    )
+
+
+def _digest(transcript: sm3.SM3) -> bytes:
+    return transcript.copy().digest()
+
+
+@dataclass(frozen=True, slots=True)
+class Agreed:
+    """What a client has when a handshake is done: who the server is, and the session's secrets."""
+
+    peer: PeerIdentity
+    secrets: SessionSecrets
+    server_cid: bytes
+    confirmation: bytes
+    """S_A, or zeros."""
+    finished: bytes
+
+
+class ClientHandshake:
+    """One attempt of a client. `hello`, then `proof(cookie)`, then `accept(offer)` until one is good."""
+
+    def __init__(self, mode: Mode, identity: Identity, cid: bytes, randomness: Randomness) -> None:
+        self.hello = Hello(mode, cid, randomness.bytes(NONCE_SIZE))
+        self._identity = identity
+        self._ephemeral = randomness.private_key() if mode is Mode.EXCHANGE else None
+        self._transcript: sm3.SM3 | None = None
+
+    def proof(self, cookie: bytes) -> bytes:
+        """The body of the PROOF."""
+        identity = self._identity
+        parts = [
+            identity.signing_certificate.to_der(),
+            identity.encryption_certificate.to_der(),
+            self._ephemeral.public_key.to_bytes() if self._ephemeral else b"",
+        ]
+        transcript = _transcript(self.hello, cookie)
+        unsigned = fields(parts)
+        transcript.update(unsigned)
+        signature = fields([sign(identity.signing_key, "handshake", b"client" + _digest(transcript))])
+        transcript.update(signature)
+        self._transcript = transcript
+        return unsigned + signature
+
+    def accept(
+        self,
+        body: bytes,
+        certificates: VerifiedCertificates,
+        *,
+        server_name: str | None,
+        at: datetime,
+        now: float,
+    ) -> Agreed:
+        """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
+        if self._transcript is None:
+            raise HandshakeRefused(Drop.UNEXPECTED, "an offer before the proof")
+        try:
+            parts, offsets = parse_fields(body, 8)
+        except Malformed as error:
+            raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
+        nonce, server_cid, signing, encryption, material, signature, confirmation, mac = parts
+        exchange = self._ephemeral is not None
+        if (
+            len(nonce) != NONCE_SIZE
+            or len(server_cid) != CID_SIZE
+            or len(confirmation) != (CONFIRMATION_SIZE if exchange else 0)
+            or (exchange and len(material) != POINT_SIZE)
+        ):
+            raise HandshakeRefused(Drop.MALFORMED, "a field of the offer has another length")
+        try:
+            peer = certificates.check(
+                signing, encryption, role=Role.SERVER, name=server_name, at=at, now=now
+            )
+        except UntrustedCertificate as error:
+            raise HandshakeRefused(Drop.CERTIFICATE, str(error)) from error
+        transcript = self._transcript.copy()
+        transcript.update(body[: offsets[5]])
+        try:
+            verify(
+                peer.signing_certificate.public_key, "handshake", b"server" + _digest(transcript), signature
+            )
+            transcript.update(body[offsets[5] : offsets[7]])
+            if self._ephemeral is not None:
+                exchange_a = sm2.KeyExchange(
+                    self._identity.encryption_key,
+                    exchange_id(self._identity.role, self._identity.encryption_certificate.to_der()),
+                    peer.encryption_certificate.public_key,
+                    exchange_id(peer.role, encryption),
+                    initiator=True,
+                    ephemeral_key=self._ephemeral,
+                )
+                shared, own = exchange_a.agree(material, SHARED_SIZE)
+                exchange_a.confirm(confirmation)
+            else:
+                shared, own = self._identity.encryption_key.decrypt(material), NO_CONFIRMATION
+        except SMCryptoError as error:
+            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold") from error
+        if len(shared) != SHARED_SIZE:
+            raise HandshakeRefused(Drop.MALFORMED, "the secret has another length")
+        keys = SessionSecrets(shared, _digest(transcript), self.hello.mode)
+        if not hmac.compare_digest(mac, finished(keys.server_finished, _digest(transcript))):
+            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold")
+        transcript.update(body[offsets[7] :])
+        return Agreed(peer, keys, server_cid, own, finished(keys.client_finished, _digest(transcript)))
+
+
+class ServerHandshake:
+    """A server's side, made from a whole PROOF: `offer` is what it says, `confirm` judges the FINISHED."""
+
+    __slots__ = ("_exchange", "_finished", "offer", "peer", "secrets")
+
+    def __init__(
+        self,
+        hello: Hello,
+        cookie: bytes,
+        body: bytes,
+        *,
+        identity: Identity,
+        certificates: VerifiedCertificates,
+        roles: tuple[Role, ...],
+        server_cid: bytes,
+        randomness: Randomness,
+        at: datetime,
+        now: float,
+    ) -> None:
+        """Raise HandshakeRefused unless certificates and signature hold. The cookie was checked before."""
+        exchange = hello.mode is Mode.EXCHANGE
+        try:
+            (signing, encryption, point, signature), offsets = parse_fields(body, 4)
+        except Malformed as error:
+            raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
+        if len(point) != (POINT_SIZE if exchange else 0):
+            raise HandshakeRefused(Drop.MALFORMED, "a field of the proof has another length")
+        try:
+            self.peer = certificates.check(signing, encryption, role=roles, name=None, at=at, now=now)
+        except UntrustedCertificate as error:
+            hint = {ExpiredCertificate: Reason.EXPIRED, NotAllowed: Reason.NOT_ALLOWED}.get(
+                type(error), Reason.CERTIFICATE
+            )
+            raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
+        transcript = _transcript(hello, cookie)
+        transcript.update(body[: offsets[3]])
+        self._exchange: sm2.KeyExchange | None = None
+        try:
+            verify(
+                self.peer.signing_certificate.public_key,
+                "handshake",
+                b"client" + _digest(transcript),
+                signature,
+            )
+            transcript.update(body[offsets[3] :])
+            public_key = self.peer.encryption_certificate.public_key
+            if exchange:
+                self._exchange = sm2.KeyExchange(
+                    identity.encryption_key,
+                    exchange_id(identity.role, identity.encryption_certificate.to_der()),
+                    public_key,
+                    exchange_id(self.peer.role, encryption),
+                    initiator=False,
+                    ephemeral_key=randomness.private_key(),
+                )
+                shared, confirmation = self._exchange.agree(point, SHARED_SIZE)
+                material = self._exchange.ephemeral
+            else:
+                shared, confirmation = randomness.bytes(SHARED_SIZE), b""
+                material = public_key.encrypt(shared)
+        except SMCryptoError as error:
+            raise HandshakeRefused(Drop.SIGNATURE, "the proof does not hold") from error
+        unsigned = fields(
+            [
+                randomness.bytes(NONCE_SIZE),
+                server_cid,
+                identity.signing_certificate.to_der(),
+                identity.encryption_certificate.to_der(),
+                material,
+            ]
+        )
+        transcript.update(unsigned)
+        signature = sign(identity.signing_key, "handshake", b"server" + _digest(transcript))
+        signed = fields([signature, confirmation])
+        transcript.update(signed)
+        self.secrets = SessionSecrets(shared, _digest(transcript), hello.mode)
+        last = fields([finished(self.secrets.server_finished, _digest(transcript))])
+        transcript.update(last)
+        self._finished = finished(self.secrets.client_finished, _digest(transcript))
+        self.offer = unsigned + signed + last
+
+    def confirm(self, confirmation: bytes, mac: bytes) -> None:
+        """Return if the client's FINISHED holds, else HandshakeRefused."""
+        try:
+            if self._exchange is not None:
+                self._exchange.confirm(confirmation)
+            elif confirmation != NO_CONFIRMATION:
+                raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold")
+        except SMCryptoError as error:
+            raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold") from error
+        if not hmac.compare_digest(mac, self._finished):
+            raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold")

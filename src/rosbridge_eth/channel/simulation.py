@@ -1,0 +1,146 @@
+"""A network made of a seed: it loses, doubles, delays, reorders and corrupts datagrams, and moves hosts.
+
+For tests and for trying out settings: whole conversations in simulated time,
+no socket, no sleeping, the same every time for the same seed. Random numbers
+here decide the fate of datagrams and are not near any key.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from rosbridge_eth.channel.admission import Address
+from rosbridge_eth.channel.events import Event
+
+__all__ = ["Endpoint", "Faults", "Host", "Network"]
+
+
+class Endpoint(Protocol):
+    """What Client and Server have in common."""
+
+    def receive_datagram(self, data: bytes, address: Address, now: float) -> None: ...
+
+    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]: ...
+
+    def next_timer(self) -> float | None: ...
+
+    def handle_timer(self, now: float) -> None: ...
+
+    def next_event(self) -> Event | None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What happens to a datagram: probabilities from 0 to 1, times in seconds."""
+
+    loss: float = 0.0
+    duplication: float = 0.0
+    corruption: float = 0.0
+    delay: float = 0.02
+    jitter: float = 0.0
+    """Up to so much more delay, drawn for each datagram: what reorders them."""
+
+
+class Host:
+    """An endpoint at an address, and what is done with its events."""
+
+    def __init__(self, endpoint: Endpoint, address: Address, on_event: Callable[[Event], None]) -> None:
+        self.endpoint = endpoint
+        self.address = address
+        self.on_event = on_event
+
+
+class Network:
+    """Hosts, datagrams on their way, and the time. `run` goes on until nothing is left to do or a condition holds."""
+
+    def __init__(self, seed: int, faults: Faults, *, start: float = 1000.0) -> None:
+        self.now = start
+        self.faults = faults
+        self.random = random.Random(seed)  # noqa: S311 - fate, not secrets
+        self.hosts: list[Host] = []
+        self.delivered = 0
+        self.watch: Callable[[bytes, Address, Address], None] | None = None
+        """Called with every datagram sent (data, from, to), before its fate is drawn."""
+        self._on_the_way: list[tuple[float, int, bytes, Address, Address]] = []
+        self._calls: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = 0
+
+    def attach(self, endpoint: Endpoint, address: Address, on_event: Callable[[Event], None]) -> Host:
+        host = Host(endpoint, address, on_event)
+        self.hosts.append(host)
+        return host
+
+    def at(self, when: float, call: Callable[[], None]) -> None:
+        """Call `call` at the time `when`."""
+        self._count += 1
+        heapq.heappush(self._calls, (when, self._count, call))
+
+    def inject(self, data: bytes, source: Address, target: Address, delay: float = 0.0) -> None:
+        """Let somebody send a datagram with any source address; it arrives unharmed."""
+        self._count += 1
+        heapq.heappush(self._on_the_way, (self.now + delay, self._count, data, source, target))
+
+    def send(self, data: bytes, source: Address, target: Address) -> None:
+        """Draw a datagram's fate."""
+        if self.watch is not None:
+            self.watch(data, source, target)
+        faults, draw = self.faults, self.random
+        if draw.random() < faults.loss:
+            return
+        copies = 2 if draw.random() < faults.duplication else 1
+        for _ in range(copies):
+            if draw.random() < faults.corruption:
+                data = self._corrupted(data)
+            self.inject(data, source, target, faults.delay + draw.random() * faults.jitter)
+
+    def _corrupted(self, data: bytes) -> bytes:
+        draw = self.random
+        if draw.random() < 0.2:
+            return data[: draw.randrange(len(data))]
+        damaged = bytearray(data)
+        for _ in range(draw.randint(1, 3)):
+            damaged[draw.randrange(len(damaged))] ^= 1 << draw.randrange(8)
+        return bytes(damaged)
+
+    def settle(self) -> None:
+        """Hand out every event there is, and let every host send what it may send now."""
+        for host in self.hosts:
+            while (event := host.endpoint.next_event()) is not None:
+                host.on_event(event)
+        for host in self.hosts:
+            for data, target in host.endpoint.datagrams_to_send(self.now):
+                self.send(data, host.address, target)
+
+    def step(self) -> bool:
+        """Go on to the next thing that happens; False if there is none."""
+        self.settle()
+        times = [when for host in self.hosts if (when := host.endpoint.next_timer()) is not None]
+        times += [queue[0][0] for queue in (self._on_the_way, self._calls) if queue]
+        if not times:
+            return False
+        self.now = max(self.now, min(times))
+        while self._calls and self._calls[0][0] <= self.now:
+            heapq.heappop(self._calls)[2]()
+        while self._on_the_way and self._on_the_way[0][0] <= self.now:
+            _, _, data, source, target = heapq.heappop(self._on_the_way)
+            for host in self.hosts:
+                if host.address == target:
+                    host.endpoint.receive_datagram(data, source, self.now)
+                    self.delivered += 1
+        for host in self.hosts:
+            when = host.endpoint.next_timer()
+            if when is not None and when <= self.now:
+                host.endpoint.handle_timer(self.now)
+        return True
+
+    def run(self, until: Callable[[], bool], *, limit: float = 600.0) -> bool:
+        """Step until `until()`; False if `limit` simulated seconds pass, or nothing can happen, before it holds."""
+        end = self.now + limit
+        while not until():
+            if self.now >= end or not self.step():
+                return until()
+        return True

@@ -1,0 +1,472 @@
+"""Who is who: roles, names, certificates under the operator's CA, and signatures bound to a purpose.
+
+An identity is a role and a name with two SM2 key pairs, as in TLCP (GB/T
+38636-2020, 6.4.5.3): one for signatures, one for encryption and key exchange,
+each with its X.509 certificate. The name stands in the subject alternative
+name `urn:rosbridge-eth:ROLE:NAME`; nothing else in a certificate is believed
+to say who somebody is.
+
+Every signature covers `"rosbridge-eth/1 " ‖ purpose ‖ 0x00 ‖ body`, so that
+one made for a purpose means nothing for another.
+
+Not here: how certificates travel (channel), what is encrypted to whom (sealing).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from rosbridge_eth.errors import IdentityError
+from rosbridge_eth.records import robot_id
+from smcrypto import CertificateError, InvalidKey, InvalidSignature, SMCryptoError, sm2, x509
+
+__all__ = [
+    "CertificateAuthority",
+    "ExpiredCertificate",
+    "Identity",
+    "NotAllowed",
+    "PeerIdentity",
+    "RevokedCertificate",
+    "Role",
+    "Trust",
+    "UntrustedCertificate",
+    "WrongName",
+    "WrongRole",
+    "check_name",
+    "create_ca",
+    "enrol",
+    "enrol_requests",
+    "identity_files",
+    "identity_from_files",
+    "load_identity",
+    "read_certificates",
+    "requests",
+    "save_identity",
+    "sign",
+    "verify",
+]
+
+SIGNATURE_SIZE = 64
+"""Bytes of a signature: r ‖ s, GB/T 32918.2."""
+
+URI_PREFIX = "urn:rosbridge-eth:"
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
+_PURPOSE = re.compile(r"[a-z][a-z-]*\Z")
+
+# GB/T 38636-2020, 6.4.5.3: a signing certificate signs, an encryption certificate takes keys.
+SIGNING_USAGE = ("digitalSignature",)
+ENCRYPTION_USAGE = ("keyEncipherment", "dataEncipherment", "keyAgreement")
+
+_FILES = ("sign.key.pem", "sign.crt.pem", "enc.key.pem", "enc.crt.pem", "ca.crt.pem")
+
+
+class Role(StrEnum):
+    """What an identity may be; it stands in the certificate and in every handshake."""
+
+    ROBOT = "robot"
+    SERVER = "server"
+    READER = "reader"
+    OPERATOR = "operator"
+
+
+class UntrustedCertificate(IdentityError):
+    """A certificate is malformed, of another CA, for another use, or the two are not of one identity."""
+
+
+class ExpiredCertificate(UntrustedCertificate):
+    """A certificate is not valid yet, or not any more."""
+
+
+class RevokedCertificate(UntrustedCertificate):
+    """A certificate stands in a revocation list of its issuer."""
+
+
+class WrongRole(UntrustedCertificate):
+    """The certificate is good, but its holder has another role than the one expected here."""
+
+
+class WrongName(UntrustedCertificate):
+    """The certificate is good, but it is somebody else's."""
+
+
+class NotAllowed(UntrustedCertificate):
+    """The certificate is good, but its holder is not, or no longer, on the allow list."""
+
+
+def check_name(name: str) -> str:
+    """`name`, if it is 1 to 63 of `a-z 0-9 _ . -` and begins with a letter or digit; else IdentityError."""
+    if not isinstance(name, str) or not _NAME.match(name):
+        raise IdentityError(
+            f"the name {name!r} cannot be used: 1 to 63 of a-z, 0-9, '_', '.', '-', and first a letter or digit"
+        )
+    return name
+
+
+def uri(role: Role, name: str) -> str:
+    """The subject alternative name of an identity."""
+    return f"{URI_PREFIX}{Role(role)}:{check_name(name)}"
+
+
+def _extended_key_usage(role: Role) -> str:
+    return "serverAuth" if role is Role.SERVER else "clientAuth"
+
+
+@dataclass(frozen=True, slots=True)
+class PeerIdentity:
+    """Somebody, as two certificates say: checked if it came from `Trust.check`."""
+
+    role: Role
+    name: str
+    signing_certificate: x509.Certificate = field(repr=False)
+    encryption_certificate: x509.Certificate = field(repr=False)
+
+    @property
+    def robot_id(self) -> bytes:
+        """Tk of the contract, 32 bytes; see records."""
+        return robot_id(self.name)
+
+    @property
+    def not_before(self) -> datetime:
+        """Both certificates are valid from here."""
+        return max(self.signing_certificate.not_before, self.encryption_certificate.not_before)
+
+    @property
+    def not_after(self) -> datetime:
+        """Both certificates are valid until here."""
+        return min(self.signing_certificate.not_after, self.encryption_certificate.not_after)
+
+    def __str__(self) -> str:
+        return f"{self.role} {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """One's own two key pairs and their certificates. Its repr shows no key."""
+
+    role: Role
+    name: str
+    signing_key: sm2.PrivateKey = field(repr=False)
+    signing_certificate: x509.Certificate = field(repr=False)
+    encryption_key: sm2.PrivateKey = field(repr=False)
+    encryption_certificate: x509.Certificate = field(repr=False)
+
+    @property
+    def public(self) -> PeerIdentity:
+        """What others may know of it."""
+        return PeerIdentity(self.role, self.name, self.signing_certificate, self.encryption_certificate)
+
+    def __str__(self) -> str:
+        return f"{self.role} {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateAuthority:
+    """The operator's CA: its key (not shown) and its certificate."""
+
+    key: sm2.PrivateKey = field(repr=False)
+    certificate: x509.Certificate = field(repr=False)
+
+
+# Signatures bound to a purpose
+
+
+def _message(purpose: str, body: bytes) -> bytes:
+    if not _PURPOSE.match(purpose):
+        raise ValueError(f"a purpose is lower-case letters and hyphens, not {purpose!r}")
+    return b"rosbridge-eth/1 " + purpose.encode("ascii") + b"\0" + body
+
+
+def sign(key: sm2.PrivateKey, purpose: str, body: bytes) -> bytes:
+    """The 64-byte SM2 signature r ‖ s of `body` for `purpose`."""
+    return key.sign(_message(purpose, body), encoding="raw")
+
+
+def verify(public_key: sm2.PublicKey, purpose: str, body: bytes, signature: bytes) -> None:
+    """Return if `signature` is `public_key`'s for `purpose` and `body`; else smcrypto.InvalidSignature."""
+    if len(signature) != SIGNATURE_SIZE:
+        raise InvalidSignature("the signature does not hold")
+    public_key.verify(signature, _message(purpose, body), encoding="raw")
+
+
+# Trust
+
+
+def _holder(certificate: x509.Certificate) -> tuple[Role, str]:
+    names = [name for name in certificate.subject_alt_names if name.startswith("URI:" + URI_PREFIX)]
+    if len(names) != 1 or len(certificate.subject_alt_names) != 1:
+        raise UntrustedCertificate(f"a certificate must carry exactly one name, {URI_PREFIX}ROLE:NAME")
+    role, _, name = names[0].removeprefix("URI:" + URI_PREFIX).partition(":")
+    if role not in Role.__members__.values() or not _NAME.match(name):
+        raise UntrustedCertificate(f"{names[0]!r} names no role and name that exist here")
+    return Role(role), name
+
+
+def _apart(signing: Collection[str] | None, encryption: Collection[str] | None) -> bool:
+    """Whether both certificates say what they are for, and not the same."""
+    if signing is None or encryption is None:
+        return False
+    return not set(ENCRYPTION_USAGE) & set(signing) and not set(SIGNING_USAGE) & set(encryption)
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """Whom to believe: the operator's roots, intermediates and revocation lists, and who is on the allow list.
+
+    allowed: called with a peer whose certificates are good; False refuses it.
+    None allows everybody with a good certificate.
+    """
+
+    roots: Sequence[x509.Certificate]
+    intermediates: Sequence[x509.Certificate] = ()
+    allowed: Callable[[PeerIdentity], bool] | None = None
+    crls: Sequence[Any] = ()
+
+    def check(
+        self,
+        signing_der: bytes,
+        encryption_der: bytes,
+        *,
+        role: Role | Iterable[Role],
+        name: str | None = None,
+        at: datetime,
+    ) -> PeerIdentity:
+        """Who the two certificates (DER) say they are, if all of it holds at `at` (aware UTC).
+
+        role: the one expected, or several; name: None for any. Raises a
+        subclass of UntrustedCertificate that tells why. Costs two or more
+        signature verifications; `examine` and `permit` are its two halves.
+        """
+        peer = self.examine(signing_der, encryption_der, at=at)
+        self.permit(peer, role=role, name=name, at=at)
+        return peer
+
+    def examine(self, signing_der: bytes, encryption_der: bytes, *, at: datetime) -> PeerIdentity:
+        """The costly half of `check`: the chains, the uses, and that both certificates are of one identity."""
+        try:
+            signing = x509.Certificate.from_der(signing_der)
+            encryption = x509.Certificate.from_der(encryption_der)
+            holder, other = _holder(signing), _holder(encryption)
+        except (CertificateError, InvalidKey) as error:
+            raise UntrustedCertificate(f"a certificate cannot be read: {error}") from error
+        if holder != other:
+            raise UntrustedCertificate("the signing and the encryption certificate are of two identities")
+        peer = PeerIdentity(*holder, signing, encryption)
+        self._check_validity(peer, at)
+        for certificate, usage in ((signing, ("digitalSignature",)), (encryption, ("keyAgreement",))):
+            try:
+                x509.verify_chain(
+                    certificate,
+                    intermediates=self.intermediates,
+                    roots=self.roots,
+                    at=at,
+                    extended_key_usage=_extended_key_usage(peer.role),
+                    key_usage=usage,
+                    crls=self.crls,
+                )
+            except CertificateError as error:
+                kind = RevokedCertificate if "revoked" in str(error) else UntrustedCertificate
+                raise kind(f"the certificate of {peer} is not to be trusted: {error}") from error
+        if not _apart(signing.key_usage, encryption.key_usage):
+            raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
+        return peer
+
+    def permit(
+        self, peer: PeerIdentity, *, role: Role | Iterable[Role], name: str | None = None, at: datetime
+    ) -> None:
+        """The cheap half of `check`, for certificates that were examined before: validity, role, name, list."""
+        self._check_validity(peer, at)
+        roles = (role,) if isinstance(role, Role) else tuple(role)
+        if peer.role not in roles:
+            raise WrongRole(f"{peer} was met where a {' or '.join(roles)} is expected")
+        if name is not None and peer.name != name:
+            raise WrongName(f"{peer} was met where {name} is expected")
+        if self.allowed is not None and not self.allowed(peer):
+            raise NotAllowed(f"{peer} is not on the allow list")
+
+    @staticmethod
+    def _check_validity(peer: PeerIdentity, at: datetime) -> None:
+        if not peer.not_before <= at <= peer.not_after:
+            raise ExpiredCertificate(
+                f"the certificate of {peer} is valid from {peer.not_before} to {peer.not_after}, not at {at}"
+            )
+
+
+# Creating identities
+
+
+def create_ca(
+    name: str,
+    *,
+    at: datetime,
+    valid_for: timedelta = timedelta(days=3650),
+    key: sm2.PrivateKey | None = None,
+) -> CertificateAuthority:
+    """A new CA whose certificate says CN=`name`; it can issue to identities only, not to other CAs."""
+    key = key or sm2.PrivateKey.generate()
+    certificate = x509.self_signed(
+        key, subject={"CN": name}, not_before=at, not_after=at + valid_for, ca=True, path_length=0
+    )
+    return CertificateAuthority(key, certificate)
+
+
+def requests(
+    name: str, signing_key: sm2.PrivateKey, encryption_key: sm2.PrivateKey
+) -> tuple[x509.CertificateSigningRequest, x509.CertificateSigningRequest]:
+    """The two certificate requests (signing, encryption) of keys that never leave their machine."""
+    subject = {"CN": check_name(name)}
+    return (
+        x509.CertificateSigningRequest.create(signing_key, subject=subject),
+        x509.CertificateSigningRequest.create(encryption_key, subject=subject),
+    )
+
+
+def enrol_requests(
+    ca: CertificateAuthority,
+    role: Role,
+    name: str,
+    signing_request: x509.CertificateSigningRequest,
+    encryption_request: x509.CertificateSigningRequest,
+    *,
+    at: datetime,
+    valid_for: timedelta = timedelta(days=825),
+) -> PeerIdentity:
+    """Certificates for `role` and `name` over the keys of two requests.
+
+    Role, name, uses and validity are the CA's to say; of a request only the
+    key and the subject are taken, and the subject must be CN=`name`.
+    """
+    certificates = []
+    for request, usage in ((signing_request, SIGNING_USAGE), (encryption_request, ENCRYPTION_USAGE)):
+        try:
+            request.verify()
+        except SMCryptoError as error:
+            raise IdentityError(f"the certificate request for {name} is not signed by its own key") from error
+        if str(request.subject) != f"CN={name}":
+            raise IdentityError(f"the certificate request says {request.subject}, not CN={name}")
+        certificates.append(
+            x509.issue(
+                request,
+                ca.certificate,
+                ca.key,
+                not_before=at,
+                not_after=min(at + valid_for, ca.certificate.not_after),
+                key_usage=usage,
+                extended_key_usage=(_extended_key_usage(Role(role)),),
+                subject_alt_names=("URI:" + uri(role, name),),
+            )
+        )
+    if signing_request.public_key.to_bytes() == encryption_request.public_key.to_bytes():
+        raise IdentityError("the signing and the encryption key must be two keys")
+    return PeerIdentity(Role(role), name, *certificates)
+
+
+def enrol(
+    ca: CertificateAuthority,
+    role: Role,
+    name: str,
+    *,
+    at: datetime,
+    valid_for: timedelta = timedelta(days=825),
+    signing_key: sm2.PrivateKey | None = None,
+    encryption_key: sm2.PrivateKey | None = None,
+) -> Identity:
+    """A new identity with two fresh keys (or the given ones) and certificates valid from `at`."""
+    signing_key = signing_key or sm2.PrivateKey.generate()
+    encryption_key = encryption_key or sm2.PrivateKey.generate()
+    signing_request, encryption_request = requests(name, signing_key, encryption_key)
+    peer = enrol_requests(
+        ca, role, name, signing_request, encryption_request, at=at, valid_for=valid_for
+    )
+    return Identity(
+        peer.role, name, signing_key, peer.signing_certificate, encryption_key, peer.encryption_certificate
+    )
+
+
+# Files
+
+
+def identity_files(
+    identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None
+) -> dict[str, bytes]:
+    """The identity as file name → content; keys are PKCS#8 PEM, encrypted under `password` unless None."""
+    return {
+        "sign.key.pem": identity.signing_key.to_pem(password),
+        "sign.crt.pem": identity.signing_certificate.to_pem(),
+        "enc.key.pem": identity.encryption_key.to_pem(password),
+        "enc.crt.pem": identity.encryption_certificate.to_pem(),
+        "ca.crt.pem": b"".join(root.to_pem() for root in roots),
+    }
+
+
+def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
+    """Every certificate of a PEM file, in order; IdentityError if there is none or one is malformed."""
+    end = b"-----END CERTIFICATE-----"
+    blocks = pem.split(end)
+    try:
+        found = tuple(x509.Certificate.from_pem(block + end + b"\n") for block in blocks[:-1])
+    except SMCryptoError as error:
+        raise IdentityError(f"a certificate cannot be read: {error}") from error
+    if not found:
+        raise IdentityError("no certificate was found in the file")
+    return found
+
+
+def identity_from_files(
+    files: Mapping[str, bytes], password: bytes | None
+) -> tuple[Identity, tuple[x509.Certificate, ...]]:
+    """The reverse of `identity_files`: the identity and the roots. Keys must belong to their certificates."""
+    missing = [name for name in _FILES if name not in files]
+    if missing:
+        raise IdentityError(f"the identity is not complete: {', '.join(missing)} missing")
+    keys: list[sm2.PrivateKey] = []
+    for name in ("sign.key.pem", "enc.key.pem"):
+        try:
+            keys.append(sm2.PrivateKey.from_pem(files[name], password))
+        except SMCryptoError as error:
+            raise IdentityError(f"{name} cannot be opened: wrong password, or not a key file") from error
+    (signing, *_), (encryption, *_) = (read_certificates(files[n]) for n in ("sign.crt.pem", "enc.crt.pem"))
+    for key, certificate, name in zip(keys, (signing, encryption), ("sign", "enc"), strict=True):
+        if key.public_key.to_bytes() != certificate.public_key.to_bytes():
+            raise IdentityError(f"{name}.key.pem is not the key of {name}.crt.pem")
+    holder = _holder(signing)
+    if _holder(encryption) != holder:
+        raise IdentityError("sign.crt.pem and enc.crt.pem are of two identities")
+    identity = Identity(*holder, keys[0], signing, keys[1], encryption)
+    return identity, read_certificates(files["ca.crt.pem"])
+
+
+def save_identity(
+    folder: Path, identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None
+) -> None:
+    """Write `identity_files` into `folder` (made 0700 if absent), key files 0600; nothing is overwritten."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for name, content in identity_files(identity, roots, password).items():
+        mode = 0o600 if name.endswith(".key.pem") else 0o644
+        try:
+            handle = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        except FileExistsError:
+            raise IdentityError(f"{folder / name} exists and is not overwritten") from None
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+
+
+def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
+    """Read what `save_identity` wrote; a key file that others may read is refused."""
+    files: dict[str, bytes] = {}
+    for name in _FILES:
+        path = folder / name
+        try:
+            if name.endswith(".key.pem") and stat.S_IMODE(path.stat().st_mode) & 0o077:
+                raise IdentityError(f"{path} can be read by others; run: chmod 600 {path}")
+            files[name] = path.read_bytes()
+        except OSError as error:
+            raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
+    return identity_from_files(files, password)
