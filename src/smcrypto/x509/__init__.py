@@ -18,7 +18,7 @@ from smcrypto.x509.issuing import (
 from smcrypto.x509.names import Attribute, Name
 from smcrypto.x509.request import CertificateSigningRequest, RequestAttribute
 from smcrypto.x509.revocation import CertificateRevocationList, RevokedCertificate
-from smcrypto.x509.signed import CertificateSignatureError
+from smcrypto.x509.signed import CertificateRevokedError, CertificateSignatureError
 
 __all__ = [
     "CA_KEY_USAGE",
@@ -29,6 +29,7 @@ __all__ = [
     "BasicConstraints",
     "Certificate",
     "CertificateRevocationList",
+    "CertificateRevokedError",
     "CertificateSignatureError",
     "CertificateSigningRequest",
     "Extension",

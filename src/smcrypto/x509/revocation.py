@@ -19,7 +19,15 @@ from smcrypto.inputs import BytesLike, as_bytes
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
 from smcrypto.x509.names import Name
-from smcrypto.x509.signed import SM2_WITH_SM3, instant, one_block, parsing, read_signed, sign
+from smcrypto.x509.signed import (
+    SM2_WITH_SM3,
+    CertificateRevokedError,
+    instant,
+    one_block,
+    parsing,
+    read_signed,
+    sign,
+)
 
 __all__ = ["CertificateRevocationList", "RevokedCertificate", "check_revocation"]
 
@@ -288,7 +296,7 @@ def check_revocation(
             known = True
             entry = crl.find(certificate.serial_number)
             if entry is not None:
-                raise CertificateError(f"{certificate.subject} was revoked at {entry.revoked_at}: {entry.reason}")
+                raise CertificateRevokedError(f"{certificate.subject} was revoked at {entry.revoked_at}: {entry.reason}")
         if not known and problem is not None:
             raise problem
         if not known and (every or position == 0):

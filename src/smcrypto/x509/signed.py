@@ -23,6 +23,7 @@ from smcrypto.errors import (
 
 __all__ = [
     "SM2_WITH_SM3",
+    "CertificateRevokedError",
     "CertificateSignatureError",
     "Signed",
     "instant",
@@ -39,6 +40,10 @@ _ACCEPTED: Final = (SM2_WITH_SM3, der.sequence(der.oid("1.2.156.10197.1.501"), d
 
 class CertificateSignatureError(CertificateError, InvalidSignature):
     """The signature of a certificate, request or revocation list does not hold."""
+
+
+class CertificateRevokedError(CertificateError):
+    """A revocation list of its issuer names the certificate."""
 
 
 class Signed(NamedTuple):

@@ -1,0 +1,340 @@
+"""`ca`: a small certification authority in a folder, and looking at what it and others issue.
+
+The folder holds `ca.key.pem` (encrypted, readable by its owner alone),
+`ca.crt.pem` and, once something was revoked, `ca.crl.pem`, which is also the
+record of what was revoked. Everything else is in the certificates.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from smcrypto import pem, sm2, x509
+from smcrypto.cli import passwords
+from smcrypto.cli.files import add_output, read_all, write_output, write_private
+from smcrypto.cli.keys import add_key, load_private
+from smcrypto.errors import CertificateError, InvalidOption
+
+__all__ = ["add_parser"]
+
+EXAMPLES = """\
+examples:
+  python -m smcrypto ca init --dir fleet --subject "CN=Fleet CA,O=Example" --password-file ca.pass
+  python -m smcrypto ca csr --key robot.key.pem --subject CN=robot_1 -o robot.csr.pem
+  python -m smcrypto ca issue --dir fleet --password-file ca.pass --san URI:urn:fleet:robot_1 \\
+      -o robot.crt.pem robot.csr.pem
+  python -m smcrypto ca show robot.crt.pem
+  python -m smcrypto ca verify --roots fleet/ca.crt.pem robot.crt.pem
+  python -m smcrypto ca revoke --dir fleet --password-file ca.pass --reason keyCompromise robot.crt.pem
+"""
+
+PURPOSES = {
+    "sign": x509.SIGNING_KEY_USAGE,
+    "encrypt": x509.ENCRYPTION_KEY_USAGE,
+}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    ca = subparsers.add_parser(
+        "ca",
+        help="certificates: make a CA, requests, certificates, revocation lists; show and verify them",
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = ca.add_subparsers(required=True, metavar="action")
+
+    init = commands.add_parser("init", help="make a CA: a key and a self-signed root certificate")
+    init.add_argument("--dir", type=Path, required=True, metavar="DIR", help="made if it is not there")
+    _add_subject(init)
+    _add_days(init, 3650)
+    init.add_argument("--path-length", type=int, metavar="N", help="at most N intermediate CAs below (default: any)")
+    init.add_argument("--unencrypted", action="store_true", help="write the CA's key without a password")
+    init.add_argument("--force", action="store_true", help="overwrite an existing CA")
+    _add_uid(init)
+    passwords.add_arguments(init)
+    init.set_defaults(run=run_init)
+
+    csr = commands.add_parser("csr", help="make a certificate signing request for a key")
+    add_key(csr)
+    _add_subject(csr)
+    _add_names(csr)
+    _add_uid(csr)
+    add_output(csr)
+    csr.set_defaults(run=run_csr)
+
+    issue = commands.add_parser("issue", help="issue a certificate for a request")
+    _add_authority(issue)
+    issue.add_argument("request", help="the request (PEM); '-' is stdin")
+    _add_days(issue, 365)
+    issue.add_argument("--for", dest="purpose", choices=tuple(PURPOSES), default="sign",
+                       help="which of TLCP's two certificates: usages (default: %(default)s)")
+    issue.add_argument("--intermediate", action="store_true", help="for a CA below this one")
+    issue.add_argument("--path-length", type=int, metavar="N", help="with --intermediate: CAs allowed below it")
+    _add_names(issue)
+    issue.add_argument("--requested-names", action="store_true",
+                       help="also grant the alternative names that the request asks for")
+    issue.add_argument("--request-uid", metavar="TEXT", help="distinguishing id of the request (default: --uid)")
+    _add_uid(issue)
+    add_output(issue)
+    issue.set_defaults(run=run_issue)
+
+    revoke = commands.add_parser("revoke", help="revoke certificates, or renew the revocation list")
+    _add_authority(revoke)
+    revoke.add_argument("certificates", nargs="*", type=Path, help="certificates (PEM); none renews the list")
+    revoke.add_argument("--reason", default="unspecified", help="as in RFC 5280: keyCompromise, superseded, …")
+    _add_days(revoke, 30)
+    _add_uid(revoke)
+    revoke.set_defaults(run=run_revoke)
+
+    show = commands.add_parser("show", help="print certificates, requests and revocation lists as text")
+    show.add_argument("file", nargs="?", default="-", help="PEM file; '-' or nothing is stdin")
+    show.set_defaults(run=run_show)
+
+    verify = commands.add_parser("verify", help="exit with 0 where a certificate is to be trusted, with 1 otherwise")
+    verify.add_argument("certificate", type=Path, help="PEM; certificates after the first are intermediates")
+    verify.add_argument("--roots", type=Path, required=True, metavar="FILE", help="what is trusted (PEM)")
+    verify.add_argument("--intermediates", type=Path, metavar="FILE", help="further certificates (PEM)")
+    verify.add_argument("--crl", type=Path, action="append", default=[], metavar="FILE", help="revocation list (PEM)")
+    verify.add_argument("--at", metavar="TIME", help="as 2026-01-31T12:00:00Z (default: now)")
+    verify.add_argument("--extended-key-usage", action="append", default=[], metavar="NAME",
+                        help="a purpose it must allow: serverAuth, …, or an object identifier")
+    verify.add_argument("--key-usage", action="append", default=[], metavar="NAME", help="digitalSignature, …")
+    _add_uid(verify)
+    verify.set_defaults(run=run_verify)
+
+
+def _add_subject(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--subject", required=True, metavar="NAME",
+                        help='as RFC 4514 writes it, nearest to the root last: "CN=robot_1,O=Example,C=CN"')
+
+
+def _add_names(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--san", action="append", default=[], metavar="KIND:NAME",
+                        help="subject alternative name: URI:urn:…, DNS:…, IP:…, email:…; may be repeated")
+    parser.add_argument("--extended-key-usage", action="append", default=[], metavar="NAME",
+                        help="serverAuth, clientAuth, … or an object identifier; may be repeated")
+
+
+def _add_days(parser: argparse.ArgumentParser, default: int) -> None:
+    parser.add_argument("--days", type=int, default=default, help="valid from now for so long (default: %(default)s)")
+
+
+def _add_uid(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--uid", default=sm2.DEFAULT_UID.decode(), metavar="TEXT",
+                        help="distinguishing id of the signatures (default: %(default)s)")
+
+
+def _add_authority(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--dir", type=Path, required=True, metavar="DIR", help="the CA's folder")
+    passwords.add_arguments(parser)
+
+
+def _days(options: argparse.Namespace) -> tuple[datetime, datetime]:
+    if not 1 <= options.days <= 36525:
+        raise InvalidOption("--days must be between 1 and 36525, a hundred years")
+    now = datetime.now(UTC).replace(microsecond=0)
+    return now, now + timedelta(days=options.days)
+
+
+def _authority(options: argparse.Namespace) -> tuple[x509.Certificate, sm2.PrivateKey]:
+    certificate = x509.Certificate.from_pem((options.dir / "ca.crt.pem").read_bytes())
+    options.key = options.dir / "ca.key.pem"
+    return certificate, load_private(options)
+
+
+def _one(data: bytes) -> Iterator[bytes]:
+    yield data
+
+
+def run_init(options: argparse.Namespace) -> int:
+    key_file, certificate_file = options.dir / "ca.key.pem", options.dir / "ca.crt.pem"
+    for path in (key_file, certificate_file):
+        if path.exists() and not options.force:
+            raise InvalidOption(f"{path} exists; give --force to overwrite the CA")
+    begin, end = _days(options)
+    key = sm2.PrivateKey.generate()
+    certificate = x509.self_signed(
+        key, subject=options.subject, not_before=begin, not_after=end, path_length=options.path_length,
+        uid=options.uid.encode(),
+    )  # fmt: skip
+    password = None
+    if not options.unencrypted:
+        password = passwords.read_password(options, "New password for the CA's key", confirm=True)
+    options.dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_private(key_file, key.to_pem(password=password), force=options.force)
+    write_output(certificate_file, _one(certificate.to_pem()))
+    print(f"{certificate_file}: {certificate.subject}, SM3 fingerprint {certificate.fingerprint().hex()}",
+          file=sys.stderr)
+    return 0
+
+
+def run_csr(options: argparse.Namespace) -> int:
+    request = x509.CertificateSigningRequest.create(
+        load_private(options), subject=options.subject, subject_alt_names=options.san,
+        extended_key_usage=options.extended_key_usage, uid=options.uid.encode(),
+    )  # fmt: skip
+    write_output(options.output, _one(request.to_pem()))
+    return 0
+
+
+def run_issue(options: argparse.Namespace) -> int:
+    request = x509.CertificateSigningRequest.from_pem(read_all(options.request))
+    request_uid = options.uid if options.request_uid is None else options.request_uid
+    request.verify(uid=request_uid.encode())
+    ca_certificate, ca_key = _authority(options)
+    begin, end = _days(options)
+    granted = list(request.subject_alt_names) if options.requested_names else []
+    certificate = x509.issue(
+        request, ca_certificate, ca_key, not_before=begin, not_after=end, ca=options.intermediate,
+        path_length=options.path_length, subject_alt_names=list(dict.fromkeys(options.san + granted)),
+        extended_key_usage=options.extended_key_usage,
+        key_usage=None if options.intermediate else PURPOSES[options.purpose], uid=options.uid.encode(),
+    )  # fmt: skip
+    _require_useful(certificate, ca_certificate, begin, options.uid.encode())
+    write_output(options.output, _one(certificate.to_pem()))
+    return 0
+
+
+def _require_useful(certificate: x509.Certificate, ca: x509.Certificate, at: datetime, uid: bytes) -> None:
+    """A certificate that nobody would accept is not handed out."""
+    x509.verify_chain(certificate, roots=[ca], at=at, uid=uid)
+    constraints = ca.basic_constraints
+    if certificate.is_ca and constraints is not None and constraints.path_length == 0:
+        raise CertificateError(f"{ca.subject} allows no CA below it (path length 0)")
+    if certificate.not_after > ca.not_after:
+        raise CertificateError(f"the CA's certificate ends first, at {ca.not_after}; give fewer --days")
+
+
+def run_revoke(options: argparse.Namespace) -> int:
+    certificate, key = _authority(options)
+    uid = options.uid.encode()
+    path = options.dir / "ca.crl.pem"
+    entries: list[x509.RevokedCertificate] = []
+    number = 0
+    if path.exists():
+        old = x509.CertificateRevocationList.from_pem(path.read_bytes())
+        old.verify(certificate, uid=uid)
+        entries += old.revoked
+        number = (old.number or 0) + 1
+    begin, end = _days(options)
+    for file in options.certificates:
+        revoked = x509.Certificate.from_pem(file.read_bytes())
+        revoked.verify_signature(certificate, uid=uid)
+        if all(entry.serial_number != revoked.serial_number for entry in entries):
+            entries.append(x509.RevokedCertificate(revoked.serial_number, begin, options.reason))
+    crl = x509.CertificateRevocationList.create(
+        certificate, key, revoked=entries, this_update=begin, next_update=end, number=number, uid=uid
+    )
+    write_output(path, _one(crl.to_pem()))
+    print(f"{path}: {len(entries)} revoked, valid until {end}", file=sys.stderr)
+    return 0
+
+
+def run_verify(options: argparse.Namespace) -> int:
+    leaf, *rest = x509.load_pem_certificates(options.certificate.read_bytes())
+    if options.intermediates is not None:
+        rest += x509.load_pem_certificates(options.intermediates.read_bytes())
+    try:
+        path = x509.verify_chain(
+            leaf,
+            intermediates=rest,
+            roots=x509.load_pem_certificates(options.roots.read_bytes()),
+            at=_moment(options.at),
+            uid=options.uid.encode(),
+            extended_key_usage=options.extended_key_usage,
+            key_usage=options.key_usage,
+            crls=[x509.CertificateRevocationList.from_pem(file.read_bytes()) for file in options.crl],
+        )
+    except CertificateError as error:
+        print(f"smcrypto: not trusted: {error}", file=sys.stderr)
+        return 1
+    print("trusted: " + " <- ".join(str(certificate.subject) for certificate in path), file=sys.stderr)
+    return 0
+
+
+def _moment(text: str | None) -> datetime:
+    if text is None:
+        return datetime.now(UTC)
+    try:
+        return datetime.fromisoformat(text)
+    except ValueError:
+        raise InvalidOption("--at takes a time such as 2026-01-31T12:00:00Z") from None
+
+
+# --- show ---
+
+
+def run_show(options: argparse.Namespace) -> int:
+    shown = 0
+    for label, content in pem.decode(read_all(options.file)):
+        if label == "CERTIFICATE":
+            print(_describe_certificate(x509.Certificate.from_der(content)))
+        elif label in ("CERTIFICATE REQUEST", "NEW CERTIFICATE REQUEST"):
+            print(_describe_request(x509.CertificateSigningRequest.from_der(content)))
+        elif label == "X509 CRL":
+            print(_describe_crl(x509.CertificateRevocationList.from_der(content)))
+        else:
+            continue
+        shown += 1
+    if not shown:
+        raise CertificateError("no certificate, request or revocation list in the input")
+    return 0
+
+
+def _lines(title: str, fields: dict[str, object]) -> str:
+    return "\n".join([title, *(f"  {name + ':':22}{value}" for name, value in fields.items() if value is not None)])
+
+
+def _listed(names: tuple[str, ...] | frozenset[str] | None) -> str | None:
+    if not names:
+        return None
+    return ", ".join(sorted(names) if isinstance(names, frozenset) else names)
+
+
+def _describe_certificate(certificate: x509.Certificate) -> str:
+    constraints = certificate.basic_constraints
+    ca = None
+    if constraints is not None:
+        length = "" if constraints.path_length is None else f", path length {constraints.path_length}"
+        ca = ("yes" if constraints.ca else "no") + length
+    identifier = certificate.subject_key_identifier
+    return _lines("certificate", {
+        "subject": certificate.subject,
+        "issuer": certificate.issuer,
+        "serial number": f"{certificate.serial_number:x}",
+        "not before": certificate.not_before,
+        "not after": certificate.not_after,
+        "CA": ca,
+        "key usage": _listed(certificate.key_usage),
+        "extended key usage": _listed(certificate.extended_key_usage),
+        "alternative names": _listed(certificate.subject_alt_names),
+        "key identifier": None if identifier is None else identifier.hex(),
+        "public key": certificate.public_key.to_bytes().hex(),
+        "SM3 fingerprint": certificate.fingerprint().hex(),
+    })  # fmt: skip
+
+
+def _describe_request(request: x509.CertificateSigningRequest) -> str:
+    return _lines("certificate request", {
+        "subject": request.subject,
+        "key usage": _listed(request.key_usage),
+        "extended key usage": _listed(request.extended_key_usage),
+        "alternative names": _listed(request.subject_alt_names),
+        "public key": request.public_key.to_bytes().hex(),
+    })  # fmt: skip
+
+
+def _describe_crl(crl: x509.CertificateRevocationList) -> str:
+    head = _lines("revocation list", {
+        "issuer": crl.issuer,
+        "number": crl.number,
+        "this update": crl.this_update,
+        "next update": crl.next_update,
+        "revoked": len(crl.revoked),
+    })  # fmt: skip
+    return "\n".join([head, *(f"    {e.serial_number:x} at {e.revoked_at}: {e.reason}" for e in crl.revoked)])
