@@ -18,7 +18,7 @@ from smcrypto import der, sm3
 from smcrypto.errors import InvalidCiphertext, InvalidEncoding, InvalidKey, InvalidOption
 from smcrypto.kdf import sm2_kdf
 from smcrypto.sm2.curve import Curve, Point, decode_point, encode_point, require_point
-from smcrypto.sm2.known_keys import comb_if_known, saw
+from smcrypto.sm2.known_keys import known_keys
 from smcrypto.sm2.points import base_comb, secret_sum, to_affine_all
 
 __all__ = ["decode_ciphertext", "decrypt", "encode_ciphertext", "encrypt"]
@@ -32,12 +32,12 @@ def encrypt(curve: Curve, P: Point, message: bytes, nonces: Iterator[int]) -> tu
         k = next(nonces)
         # A2 and A4. A3 asks for [h]P != O, which holds for every public key (curve.require_point).
         C1, shared = to_affine_all(
-            [secret_sum(curve, (k, base_comb(curve))), secret_sum(curve, (k, comb_if_known(curve, P) or P))], curve
+            [secret_sum(curve, (k, base_comb(curve))), secret_sum(curve, (k, known_keys.comb(curve, P) or P))], curve
         )
         x2, y2 = _field_elements(shared, curve)
         C2 = _mask(x2 + y2, message)
         if C2 is not None:
-            saw(curve, P)
+            known_keys.used(curve, P)
             return C1, sm3.digest(x2 + message + y2), C2
 
 

@@ -15,7 +15,7 @@ from smcrypto.inputs import BytesLike, as_bytes
 from smcrypto.kdf import sm2_kdf
 from smcrypto.sm2.curve import Curve, Point, decode_point, encode_point
 from smcrypto.sm2.keys import PrivateKey, PublicKey
-from smcrypto.sm2.known_keys import comb_if_known, saw
+from smcrypto.sm2.known_keys import known_keys
 from smcrypto.sm2.points import secret_sum, to_affine
 from smcrypto.sm2.signature import z_value
 
@@ -36,7 +36,7 @@ def shared_point(curve: Curve, d: int, r: int, R: Point, peer_P: Point, peer_R: 
     """
     ht = curve.h * (d + reduced_x(R, curve) * r) % curve.n
     point = secret_sum(
-        curve, (ht, comb_if_known(curve, peer_P) or peer_P), (ht * reduced_x(peer_R, curve) % curve.n, peer_R)
+        curve, (ht, known_keys.comb(curve, peer_P) or peer_P), (ht * reduced_x(peer_R, curve) % curve.n, peer_R)
     )
     return to_affine(point, curve)
 
@@ -99,7 +99,7 @@ class KeyExchange:
         V = shared_point(curve, self._own.to_int(), self._ephemeral_key.to_int(), self._ephemeral, peer_P, peer_R)
         if V is None:
             raise InvalidKey("the shared point is at infinity")
-        saw(curve, peer_P)
+        known_keys.used(curve, peer_P)
         self._ephemeral_key = None
         size = curve.field_bytes
         x, y = V[0].to_bytes(size, "big"), V[1].to_bytes(size, "big")

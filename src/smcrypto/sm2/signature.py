@@ -16,7 +16,7 @@ from typing import Final
 from smcrypto import der, sm3
 from smcrypto.errors import InvalidEncoding, InvalidLength, InvalidOption, InvalidSignature
 from smcrypto.sm2.curve import Curve, Point
-from smcrypto.sm2.known_keys import comb_if_known, saw
+from smcrypto.sm2.known_keys import known_keys
 from smcrypto.sm2.points import base_comb, public_sum, secret_sum, to_affine_all
 
 __all__ = ["DEFAULT_UID", "decode_signature", "encode_signature", "message_digest", "sign", "verify", "z_value"]
@@ -66,12 +66,11 @@ def verify(curve: Curve, P: Point, e: int, r: int, s: int) -> None:
     t = (r + s) % n
     if not (0 < r < n and 0 < s < n) or t == 0:
         raise InvalidSignature("the signature does not hold")
-    X, _, Z = public_sum(curve, (s, base_comb(curve)), (t, comb_if_known(curve, P) or P))
+    X, _, ZZ, _ = public_sum(curve, (s, base_comb(curve)), (t, known_keys.comb(curve, P) or P))
     # B7, R = (e + x) mod n = r, without the inversion for x: X = x Z^2 for an x = r - e modulo n below p.
-    ZZ = Z * Z % p
-    if Z == 0 or all((x * ZZ - X) % p for x in range((r - e) % n, p, n)):
+    if ZZ == 0 or all((x * ZZ - X) % p for x in range((r - e) % n, p, n)):
         raise InvalidSignature("the signature does not hold")
-    saw(curve, P)
+    known_keys.used(curve, P)
 
 
 def encode_signature(r: int, s: int, curve: Curve, encoding: str) -> bytes:

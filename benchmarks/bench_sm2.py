@@ -1,0 +1,182 @@
+"""SM2 beside gmssl and gmalg, the pure Python peers (pyca/cryptography offers no SM2).
+
+Signing and verifying start from the digest e on all sides, so that nobody's
+SM3 is measured here. "New key": each round verifies or agrees with a key that
+was never used. "Key seen before": the library has met the key several times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import cycle
+from typing import Any
+
+import pytest
+
+from smcrypto import sm2
+
+D = 0x3945208F_7B2144B1_3F36E38A_C6D39F95_88939369_2860B51A_42FB81EF_4DF7C5B8
+KEY = sm2.PrivateKey.from_int(D)
+DIGEST = bytes.fromhex("f0b43e94ba45accaace692ed534382eb17e6ab5a19ce7b31f4486fdfc0d28640")
+SESSION_KEY = bytes(range(16))
+TEXT = bytes(range(256))
+NEW_KEYS = 30  # rounds of the benchmarks that need a fresh key each time
+
+
+def gmssl_key(mode: int = 1) -> Any:
+    gmssl_sm2 = pytest.importorskip("gmssl.sm2")
+    # Without its 04, since gmssl strips every leading 0 and 4.
+    return gmssl_sm2.CryptSM2(f"{D:064x}", KEY.public_key.to_bytes()[1:].hex(), mode=mode)
+
+
+def gmalg_key(uid: bytes = sm2.DEFAULT_UID) -> Any:
+    gmalg = pytest.importorskip("gmalg")
+    return gmalg.SM2(D.to_bytes(32, "big"), uid, KEY.public_key.to_bytes())
+
+
+def run(benchmark: Any, implementation: str, function: Callable[..., Any], *args: Any) -> None:
+    benchmark.extra_info["implementation"] = implementation
+    benchmark(function, *args)
+
+
+def run_with_new_key(benchmark: Any, function: Callable[[sm2.PrivateKey], Callable[[], Any]]) -> None:
+    """One round for each of many keys; `function` prepares the round."""
+    benchmark.extra_info["implementation"] = "smcrypto"
+    rounds = iter([function(sm2.PrivateKey.generate()) for _ in range(NEW_KEYS)])
+    benchmark.pedantic(lambda call: call(), setup=lambda: ((next(rounds),), {}), rounds=NEW_KEYS)
+
+
+def meet(public_key: sm2.PublicKey) -> None:
+    """Use the key until the library knows it."""
+    signature = KEY.sign_digest(DIGEST)
+    for _ in range(5):
+        public_key.verify_digest(signature, DIGEST)
+
+
+@pytest.mark.benchmark(group="SM2 key generation")
+def test_keygen_smcrypto(benchmark: Any) -> None:
+    run(benchmark, "smcrypto", lambda: sm2.PrivateKey.generate().public_key)
+
+
+@pytest.mark.benchmark(group="SM2 key generation")
+def test_keygen_gmalg(benchmark: Any) -> None:
+    run(benchmark, "gmalg", gmalg_key().generate_keypair)
+
+
+@pytest.mark.benchmark(group="SM2 sign")
+def test_sign_smcrypto(benchmark: Any) -> None:
+    run(benchmark, "smcrypto", KEY.sign_digest, DIGEST)
+
+
+@pytest.mark.benchmark(group="SM2 sign")
+def test_sign_gmssl(benchmark: Any) -> None:
+    func = pytest.importorskip("gmssl.func")
+    key = gmssl_key()
+    run(benchmark, "gmssl", lambda: key.sign(DIGEST, func.random_hex(key.para_len)))
+
+
+@pytest.mark.benchmark(group="SM2 sign")
+def test_sign_gmalg(benchmark: Any) -> None:
+    run(benchmark, "gmalg", gmalg_key().sign, DIGEST)
+
+
+@pytest.mark.benchmark(group="SM2 verify (new key)")
+def test_verify_new_key_smcrypto(benchmark: Any) -> None:
+    def round_with(key: sm2.PrivateKey) -> Callable[[], None]:
+        signature, public_key = key.sign_digest(DIGEST), key.public_key
+        return lambda: public_key.verify_digest(signature, DIGEST)
+
+    run_with_new_key(benchmark, round_with)
+
+
+@pytest.mark.benchmark(group="SM2 verify (key seen before)")
+def test_verify_seen_key_smcrypto(benchmark: Any) -> None:
+    meet(KEY.public_key)
+    run(benchmark, "smcrypto", KEY.public_key.verify_digest, KEY.sign_digest(DIGEST), DIGEST)
+
+
+@pytest.mark.benchmark(group="SM2 verify (new key)")
+def test_verify_new_key_gmssl(benchmark: Any) -> None:
+    run_gmssl_verify(benchmark)
+
+
+@pytest.mark.benchmark(group="SM2 verify (key seen before)")
+def test_verify_seen_key_gmssl(benchmark: Any) -> None:
+    run_gmssl_verify(benchmark)
+
+
+def run_gmssl_verify(benchmark: Any) -> None:
+    key = gmssl_key()
+    signature = KEY.sign_digest(DIGEST, encoding="raw").hex()
+    assert key.verify(signature, DIGEST)
+    run(benchmark, "gmssl", key.verify, signature, DIGEST)
+
+
+@pytest.mark.benchmark(group="SM2 encrypt 16 B (key seen before)")
+def test_encrypt_seen_key_smcrypto(benchmark: Any) -> None:
+    meet(KEY.public_key)
+    run(benchmark, "smcrypto", KEY.public_key.encrypt, SESSION_KEY)
+
+
+@pytest.mark.benchmark(group="SM2 encrypt 16 B (key seen before)")
+def test_encrypt_seen_key_gmssl(benchmark: Any) -> None:
+    run(benchmark, "gmssl", gmssl_key().encrypt, SESSION_KEY)
+
+
+@pytest.mark.benchmark(group="SM2 decrypt 256 B")
+def test_decrypt_smcrypto(benchmark: Any) -> None:
+    run(benchmark, "smcrypto", KEY.decrypt, KEY.public_key.encrypt(TEXT))
+
+
+@pytest.mark.benchmark(group="SM2 decrypt 256 B")
+def test_decrypt_gmssl(benchmark: Any) -> None:
+    ciphertext = KEY.public_key.encrypt(TEXT, encoding="c1c3c2")[1:]
+    assert gmssl_key().decrypt(ciphertext) == TEXT
+    run(benchmark, "gmssl", gmssl_key().decrypt, ciphertext)
+
+
+@pytest.mark.benchmark(group="SM2 key exchange, one side (new peer)")
+def test_exchange_new_peer_smcrypto(benchmark: Any) -> None:
+    peer_ephemeral = sm2.PrivateKey.generate().public_key.to_bytes()
+
+    def round_with(key: sm2.PrivateKey) -> Callable[[], None]:
+        public_key = key.public_key
+        return lambda: exchange(public_key, peer_ephemeral)
+
+    run_with_new_key(benchmark, round_with)
+
+
+@pytest.mark.benchmark(group="SM2 key exchange, one side (peer seen before)")
+def test_exchange_seen_peer_smcrypto(benchmark: Any) -> None:
+    meet(KEY.public_key)
+    ephemerals = cycle([sm2.PrivateKey.generate().public_key.to_bytes() for _ in range(20)])
+    run(benchmark, "smcrypto", lambda: exchange(KEY.public_key, next(ephemerals)))
+
+
+def exchange(peer: sm2.PublicKey, peer_ephemeral: bytes) -> None:
+    side = sm2.KeyExchange(KEY, b"A", peer, b"B", initiator=True)
+    assert side.ephemeral
+    side.agree(peer_ephemeral, 16)
+
+
+@pytest.mark.benchmark(group="SM2 key exchange, one side (new peer)")
+def test_exchange_new_peer_gmalg(benchmark: Any) -> None:
+    run_gmalg_exchange(benchmark)
+
+
+@pytest.mark.benchmark(group="SM2 key exchange, one side (peer seen before)")
+def test_exchange_seen_peer_gmalg(benchmark: Any) -> None:
+    run_gmalg_exchange(benchmark)
+
+
+def run_gmalg_exchange(benchmark: Any) -> None:
+    gmalg = pytest.importorskip("gmalg")
+    own = gmalg_key(b"A")
+    peer = sm2.PrivateKey.generate().public_key.to_bytes()
+    peer_ephemeral = sm2.PrivateKey.generate().public_key.to_bytes()
+
+    def once() -> bytes:
+        _, t = own.begin_key_exchange()
+        return own.end_key_exchange(16, t, peer_ephemeral, b"B", peer, gmalg.KEYXCHG_MODE.INITIATOR)
+
+    run(benchmark, "gmalg", once)
