@@ -1,0 +1,145 @@
+"""The robot's process: a thread reads the source, one loop seals, spools, sends and listens.
+
+The source's thread only puts raw messages into a bounded ring; everything
+that has state belongs to the loop. A bag waits where the ring is full, so
+nothing is skipped however fast it is replayed.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+
+from rosbridge_eth.capture import CapturedRecord, RawMessage
+from rosbridge_eth.channel import Client
+from rosbridge_eth.channel.udp import UdpLoop
+from rosbridge_eth.errors import BridgeError
+from rosbridge_eth.robot.clock import clock_synchronised
+from rosbridge_eth.robot.recorder import Recorder
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.sources import Source
+from rosbridge_eth.store import Spool
+
+RING = 1024  # raw messages between the source's thread and the loop
+TAKE = 32  # raw messages sealed before the network gets its turn again
+LONGEST_WAIT = 0.25
+SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
+CLOSING_TIME = 1.0  # seconds for the server to learn that the robot leaves
+
+
+class Robot:
+    """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called.
+
+    on_captured: called with each record, in the loop's thread (the demo compares with what it reads back).
+    """
+
+    def __init__(
+        self,
+        *,
+        source: Source,
+        recorder: Recorder,
+        sender: Sender,
+        spool: Spool,
+        client: Client,
+        loop: UdpLoop,
+        on_captured: Callable[[CapturedRecord], None] = lambda record: None,
+    ) -> None:
+        self.recorder, self.sender, self.spool, self.client, self.loop = recorder, sender, spool, client, loop
+        self._source = source
+        self._on_captured = on_captured
+        self._ring: queue.Queue[RawMessage] = queue.Queue(RING)
+        self._stop = threading.Event()
+        self._source_ended = threading.Event()
+        self._source_error: BridgeError | None = None
+        self._synchronised, self._asked_at = False, float("-inf")
+
+    def stop(self) -> None:
+        """Let `run` come to an end, from any thread or a signal handler; what is not acknowledged stays spooled."""
+        self._stop.set()
+        self.loop.wake()
+
+    def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
+        """Until `stop`, or until the source has ended and the server has everything.
+
+        on_turn: called at every turn of the loop, to show progress. Raises
+        what the source raised, after everything that was captured is delivered.
+        """
+        reading = threading.Thread(target=self._read, name="source", daemon=True)
+        reading.start()
+        finished = False
+        try:
+            while not self._stop.is_set():
+                now = time.monotonic()
+                self._take(now)
+                if not finished and self._source_ended.is_set() and self._ring.empty():
+                    finished = True
+                    self.recorder.finish(wall_ns=time.time_ns(), now=now)
+                self.sender.send(now)
+                self.spool.commit(now)
+                on_turn()
+                if finished and self.sender.idle:
+                    break
+                self.loop.step(self._wait(now))
+            else:
+                self.recorder.finish(wall_ns=time.time_ns(), now=time.monotonic())
+        finally:
+            self._stop.set()
+            self._leave()
+            self._source.close()
+            reading.join(timeout=5)
+            self.spool.close()
+            self.loop.close()
+        if self._source_error is not None:
+            raise self._source_error
+
+    def _read(self) -> None:
+        try:
+            self._source.run(self._emit, self._stop)
+        except BridgeError as error:
+            self._source_error = error
+        finally:
+            self._source_ended.set()
+            self.loop.wake()
+
+    def _emit(self, raw: RawMessage) -> None:
+        while not self._stop.is_set():
+            try:
+                self._ring.put(raw, timeout=0.2)
+            except queue.Full:
+                continue
+            self.loop.wake()
+            return
+
+    def _take(self, now: float) -> None:
+        if now - self._asked_at > SYNCHRONISED_EVERY:
+            self._synchronised, self._asked_at = clock_synchronised(), now
+        for _ in range(TAKE):
+            try:
+                raw = self._ring.get_nowait()
+            except queue.Empty:
+                return
+            captured = self.recorder.take(
+                raw,
+                wall_ns=time.time_ns(),
+                mono_ns=time.monotonic_ns(),
+                now=now,
+                clock_synchronised=self._synchronised,
+            )
+            if captured is not None:
+                self._on_captured(captured)
+
+    def _wait(self, now: float) -> float:
+        if not self._ring.empty():
+            return 0.0
+        timers = (self.spool.next_commit(), self.sender.next_timer())
+        return max(0.0, min([LONGEST_WAIT, *(timer - now for timer in timers if timer is not None)]))
+
+    def _leave(self) -> None:
+        """End the session in good order, so that the server need not wait for a silent robot."""
+        now = time.monotonic()
+        deadline = now + CLOSING_TIME
+        self.client.close(now)
+        while self.client.next_timer() is not None and time.monotonic() < deadline:
+            self.loop.step(0.05)
