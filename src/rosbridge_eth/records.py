@@ -7,6 +7,7 @@ Nothing here is secret and nothing here can open a record (see sealing).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from eth_utils.crypto import keccak
 
@@ -49,3 +50,11 @@ class SealedRecord:
 
     id: RecordId
     ciphertext: bytes
+
+
+class SeqRange(NamedTuple):
+    """Records `first` to `last` of a stream, both included: what a gap record declares as dropped."""
+
+    stream: bytes
+    first: int
+    last: int
