@@ -235,9 +235,6 @@ class Reader:
         """The numbers of the bits that are set in a NamedBitList; trailing zero bits are refused (11.2.2)."""
         return _bits(self.value(BIT_STRING))
 
-    def implicit_named_bits(self, number: int) -> frozenset[int]:
-        return _bits(self.value(_CONTEXT | number))
-
     def null(self) -> None:
         start, end = self._content(NULL)
         if start != end:
@@ -275,9 +272,6 @@ class Reader:
 
     def has_implicit(self, number: int) -> bool:
         return self.peek_tag() == _CONTEXT | number
-
-    def generalized_time(self) -> datetime:
-        return _parse_time(GENERALIZED_TIME, self.value(GENERALIZED_TIME))
 
     def time(self) -> datetime:
         """A Time of RFC 5280, 4.1.2.5: UTCTime for 1950-2049, else GeneralizedTime; UTC, whole seconds."""
