@@ -17,6 +17,7 @@ from rosbridge_eth.capture.messages import (
 from rosbridge_eth.capture.paths import DEFAULT_FIELDS, parse_path, value_at
 from rosbridge_eth.capture.process import Capture, Cause, Notice, TopicStatistics
 from rosbridge_eth.capture.record import DELIVERIES, CapturedRecord, Delivery
+from rosbridge_eth.capture.restoration import Restoration, Restored
 from rosbridge_eth.capture.rules import NamePattern, TopicRule
 
 __all__ = [
@@ -34,6 +35,8 @@ __all__ = [
     "NamePattern",
     "Notice",
     "RawMessage",
+    "Restoration",
+    "Restored",
     "TopicRule",
     "TopicStatistics",
     "Wire",

@@ -49,7 +49,7 @@ to_json: Final = JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",
 
 _SECOND: Final = 10**9
 _BYTES: Final = frozenset({"uint8", "char", "byte"})
-_NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
+NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
     f"{kind}{bits}": f"<{letter}{bits // 8}"
     for kind, letter in (("int", "i"), ("uint", "u"), ("float", "f"))
     for bits in (8, 16, 32, 64)
@@ -189,7 +189,7 @@ class Conversion:
         return self._list(self._value(element, EVERYTHING, f"{path}[*]"), path)
 
     def _numbers(self, base: str, path: str) -> Converter:
-        limit, too_large, wire = self._limit, self._too_large, numpy.dtype(_NUMPY[base])
+        limit, too_large, wire = self._limit, self._too_large, numpy.dtype(NUMPY[base])
         size, binary, real = wire.itemsize, base in _BYTES, base in ("float32", "float64")
 
         def convert(value: Any) -> Any:

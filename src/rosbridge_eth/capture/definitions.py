@@ -13,8 +13,7 @@ too deeply (rosbags would recurse), a fixed array that unrolls into too much cod
 and arrays of elements that take no bytes (a count of 2**32 would cost no data).
 
 The MSG format: wiki.ros.org/msg and "Interfaces" of the ROS 2 documentation.
-IDL (OMG IDL 4.2, as rosbag2 stores it) is parsed by rosbags, which executes
-nothing of it; the resulting tree goes through the same checks.
+What is parsed from IDL (see idl) goes through the same checks.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from typing import Literal, TypeAlias, cast
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Fielddefs, FieldDesc, NameDesc, Typesdict
-from rosbags.typesys import TypesysError, get_types_from_idl
 
+from rosbridge_eth.capture.idl import parse_idl
 from rosbridge_eth.errors import SourceError
 
 Format: TypeAlias = Literal["msg", "idl"]
@@ -290,19 +289,15 @@ def _element(owner: str, name: str, bound: int) -> BaseDesc | NameDesc:
 
 
 def _parse_idl(type_name: str, text: str) -> dict[str, Fielddefs]:
-    separator = _SEPARATOR + "\n"
-    sections = [text]
-    if text.startswith(f"{separator}IDL: "):
-        sections = [section.partition("\n")[2] for section in text.split(separator)[1:]]
+    def error(reason: str) -> DefinitionError:
+        return DefinitionError(f"the IDL definition of {type_name} cannot be read: {_shown(reason)}")
+
+    # As mcap stores it: every type after a line of 80 "=" and `IDL: pkg/msg/Name`; or one text alone.
+    sections = re.split(rf"^{_SEPARATOR}\r?\n(?:IDL: [^\n]*\n)?", text, flags=re.MULTILINE)
     types: dict[str, Fielddefs] = {}
     for section in sections:
-        try:
-            tree = get_types_from_idl(section)
-        except (TypesysError, RecursionError, AssertionError, ValueError, KeyError, TypeError) as error:
-            # rosbags' IDL parser reports only part of what it dislikes by its own class.
-            raise DefinitionError(f"the IDL definition of {type_name} cannot be parsed: {_shown(str(error))}") from None
-        for name, (_, fields) in tree.items():
-            _add(types, name, fields)
+        for name, fields in parse_idl(section, error).items():
+            _add(types, normalised_type_name(name), fields)
     return types
 
 

@@ -78,7 +78,7 @@ class CapturedRecord:
             raise VerificationError(f"a record's content has version {value['v']}; this reader knows {VERSION}")
         if value["delivery"] not in DELIVERIES:
             raise VerificationError(f"'delivery' of a record's content is not one of {', '.join(DELIVERIES)}")
-        return cls(
+        record = cls(
             value["topic"],
             value["type"],
             value["received_ns"],
@@ -88,6 +88,14 @@ class CapturedRecord:
             value["data"],
             value["delivery"],
         )
+        # Also refuses what JSON allows and these rules do not: a name twice, 1e999, half of a surrogate pair.
+        try:
+            canonical = record.to_json() == encoded
+        except (ValueError, RecursionError):
+            canonical = False
+        if not canonical:
+            raise VerificationError("a record's content is not in its one form: no white space, members in order")
+        return record
 
 
 _MEMBERS: dict[str, type] = {

@@ -1,0 +1,349 @@
+"""Message definitions from strangers: what is legal is read, what is hostile never reaches rosbags' compiler."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+from rosbridge_eth.capture import DefinitionError, Wire, decoder_for, decoder_for_known, read_definition
+from rosbridge_eth.capture.definitions import MAX_DEPTH, MAX_FIELDS, MAX_TEXT, check_types
+
+SEPARATOR = "=" * 80
+
+
+def definition(*sections: str) -> str:
+    first, *others = sections
+    return "\n".join([first, *(f"{SEPARATOR}\nMSG: {other}" for other in others)])
+
+
+@pytest.mark.parametrize("type_name", sorted(get_typestore(Stores.ROS1_NOETIC).fielddefs))
+def test_every_type_of_noetic_is_read_as_rosbags_reads_it(type_name):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    text, _ = store.generate_msgdef(type_name)
+    read = read_definition(type_name, text)
+    for name, fields in read.fields.items():
+        expected = [field for field in store.fielddefs[name][1] if field[0] != "structure_needs_at_least_one_member"]
+        assert fields == expected, name
+
+
+@pytest.mark.parametrize("type_name", sorted(get_typestore(Stores.ROS2_HUMBLE).fielddefs))
+def test_every_type_of_humble_is_read_as_rosbags_reads_it(type_name):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    text, _ = store.generate_msgdef(type_name, ros_version=2)
+    if "wstring" in text:
+        pytest.skip("a wstring is refused, see below")
+    read = read_definition(type_name, text)
+    for name, fields in read.fields.items():
+        expected = [field for field in store.fielddefs[name][1] if field[0] != "structure_needs_at_least_one_member"]
+        assert fields == expected, name
+
+
+def test_what_people_write_in_definitions():
+    text = (
+        "# a comment\r\n\r\n"
+        "int32 CONST=5   # not a field\n"
+        "uint8 lower_case_constant = 1\n"
+        'string QUOTE="it\'s # no comment; import os"\n'
+        "float32 F=1e-3\n"
+        "\tint32   spaced   \t # trailing\n"
+        "int32 with_default 7\n"
+        'string greeting "hello # world"\n'
+        "string<=10 bounded\n"
+        "string<=10[<=3] bounded_strings\n"
+        "int32[<=5] at_most_five\n"
+        "float64[9] nine\n"
+        "bool[] any\n"
+        "time stamp\n"
+        "duration[2] two\n"
+        "Header header\n"
+        "Point near\n"
+        "geometry_msgs/Point far\n"
+        "float64[3] lambda\n"
+        "@key\n"
+    )
+    full = definition(
+        text,
+        "my_pkg/Point\nint8 x",
+        "geometry_msgs/Point\nfloat64 x",
+        "std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id",
+    )
+    fields = dict(read_definition("my_pkg/Thing", full).fields["my_pkg/msg/Thing"])
+    base, array, sequence = Nodetype.BASE, Nodetype.ARRAY, Nodetype.SEQUENCE
+    assert fields == {
+        "spaced": (base, ("int32", 0)),
+        "with_default": (base, ("int32", 0)),
+        "greeting": (base, ("string", 0)),
+        "bounded": (base, ("string", 10)),
+        "bounded_strings": (sequence, ((base, ("string", 10)), 3)),
+        "at_most_five": (sequence, ((base, ("int32", 0)), 5)),
+        "nine": (array, ((base, ("float64", 0)), 9)),
+        "any": (sequence, ((base, ("bool", 0)), 0)),
+        "stamp": (Nodetype.NAME, "builtin_interfaces/msg/Time"),
+        "two": (array, ((Nodetype.NAME, "builtin_interfaces/msg/Duration"), 2)),
+        "header": (Nodetype.NAME, "std_msgs/msg/Header"),
+        "near": (Nodetype.NAME, "my_pkg/msg/Point"),
+        "far": (Nodetype.NAME, "geometry_msgs/msg/Point"),
+        "lambda": (array, ((base, ("float64", 0)), 3)),
+    }
+
+
+HOSTILE_TYPE_NAMES = [
+    "",
+    "Odometry",
+    "a/b/c/d",
+    "/etc/passwd",
+    "a/../b",
+    "a//b",
+    "1a/B",
+    "a/B'",
+    'a/B"); import os; ("',
+    "a/B\nimport os",
+    "a/__import__",
+    "a/b__c",  # would share a Python name with a/b/c
+    "a/é",
+    "a/" + "B" * 10_000,
+    "_a/B",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE_TYPE_NAMES)
+def test_a_type_name_that_is_none_is_refused(name):
+    with pytest.raises(DefinitionError):
+        read_definition(name, "int32 x")
+    with pytest.raises(DefinitionError):
+        read_definition("a/B", definition("int32 x", f"{name}\nint32 y"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "int32 x; import os",
+        "int32 x\x00y",
+        "int32 __class__",
+        "int32 _x",
+        "int32 1x",
+        "int32 x'",
+        "int32 é",
+        "int32",
+        "x",
+        "int32[-1] x",
+        "int32[0] x",
+        "int32[1.5] x",
+        "int32[0x10] x",
+        "int32[99999999999] x",
+        "int32[<=] x",
+        "int32[2][2] x",
+        "int32<=5 x",
+        "string<=99999999999 s",
+        "float128 x",
+        "wstring x",
+        "long x",  # an unknown type of the same package
+        "../x y",
+        "std_msgs/Header h",  # not defined
+        "a/b/c/d x",
+        "int32 " + "x" * 1000,
+        "string[2000] s",
+        "uint8[2000000] u",
+        "float64[200000] u",
+        "@verbatim x",
+        "int32 x\nint32 x",
+        "int32 class\nint32 class_",
+        "B again",
+        "MSG: a/C",
+        SEPARATOR,
+        f"{SEPARATOR}\nint32 y",
+        f"{SEPARATOR}\nIDL: a/msg/C\nmodule a {{}};",
+        f"{SEPARATOR}\nMSG: a/B\nint64 other",  # the same type, otherwise
+        f"time t\n{SEPARATOR}\nMSG: builtin_interfaces/Time\nint64 sec\nuint32 nanosec",
+    ],
+)
+def test_a_line_that_is_no_field_is_refused(line):
+    with pytest.raises(DefinitionError):
+        read_definition("a/B", line)
+
+
+def test_types_that_contain_themselves_are_refused():
+    with pytest.raises(DefinitionError, match="contains itself"):
+        read_definition("a/A", definition("B b", "a/B\nC[] c", "a/C\nA a"))
+
+
+def test_deep_nesting_is_refused_and_reasonable_nesting_is_not():
+    def nested(depth):
+        return definition(*[("" if i == 0 else f"a/T{i}\n") + f"T{i + 1} x" for i in range(depth)], f"a/T{depth}\nint8 x")
+
+    read_definition("a/T0", nested(MAX_DEPTH))
+    with pytest.raises(DefinitionError, match="deep"):
+        read_definition("a/T0", nested(MAX_DEPTH + 1))
+
+
+def test_arrays_of_nothing_are_refused():
+    # A count of 2**32 - 1 of them would take four bytes on the wire and all the memory there is.
+    for array in ("E[] x", "E[5] x", "W[] x"):
+        with pytest.raises(DefinitionError, match="empty"):
+            read_definition("a/A", definition(array, "a/E\nint32 ONLY_A_CONSTANT=1", "a/W\nE inner"))
+    assert read_definition("a/A", definition("E x", "a/E\n")).smallest["a/msg/A"] == 0
+
+
+def test_fixed_arrays_may_not_multiply():
+    # Each level is small; together they would unroll into 10**9 elements of generated work.
+    with pytest.raises(DefinitionError, match="elements in fixed arrays"):
+        read_definition("a/A", definition("B[1000] b", "a/B\nC[1000] c", "a/C\nstring[1000] s"))
+
+
+def test_sizes_are_bounded():
+    with pytest.raises(DefinitionError, match="characters"):
+        read_definition("a/A", "#" * (MAX_TEXT + 1))
+    with pytest.raises(DefinitionError, match="fields"):
+        read_definition("a/A", "\n".join(f"int8 x{i}" for i in range(MAX_FIELDS + 1)))
+    with pytest.raises(DefinitionError, match="types"):
+        read_definition("a/A", definition("int8 x", *[f"a/T{i}\nint8 x" for i in range(300)]))
+
+
+def test_a_constant_s_text_never_reaches_generated_code():
+    marker = "test_marker_that_must_not_exist"
+    text = f"int32 x\nstring S=\"\"\"'); import sys; sys.{marker} = 1; ('\n"
+    decoder = decoder_for(Wire.ROS1, "a/Constants", text)
+    assert decoder.decode(b"\x07\x00\x00\x00").x == 7
+    assert not hasattr(sys, marker)
+    assert decoder.definition.typesdict() == {"a/msg/Constants": ([], [("x", (Nodetype.BASE, ("int32", 0)))])}
+
+
+@given(st.text(alphabet=st.sampled_from("ab/_1=[]<>#\"'\\; \n\t\x00é=int32stringtimeMSG:@()"), max_size=200))
+@example("int32 x\n" + SEPARATOR)
+@example("a b\n")
+def test_any_text_is_a_definition_or_an_error(text):
+    try:
+        read = read_definition("pkg/Type", text)
+    except DefinitionError:
+        return
+    for name, fields in read.fields.items():
+        assert all(part.isascii() and part.isidentifier() for part in name.split("/"))
+        assert all(field.isascii() and field.isidentifier() for field, _ in fields)
+
+
+def test_idl_definitions_of_rosbag2_go_through_the_same_checks():
+    idl = """
+module pkg { module msg {
+  struct Inner { int32 x; };
+  struct Outer { pkg::msg::Inner inner; sequence<double> values; string name; octet b; uint8 fixed[3]; };
+}; };
+"""
+    fields = dict(read_definition("pkg/Outer", idl, "idl").fields["pkg/msg/Outer"])
+    assert list(fields) == ["inner", "values", "name", "b", "fixed"]
+    assert fields["values"] == (Nodetype.SEQUENCE, ((Nodetype.BASE, ("float64", 0)), 0))
+    for broken in ("module a {", "module pkg { module msg { struct Outer { wstring w; }; }; };", "struct", "\x00"):
+        with pytest.raises(DefinitionError):
+            read_definition("pkg/Outer", broken, "idl")
+
+
+def test_a_tree_from_elsewhere_is_checked_like_text():
+    for fields in (
+        [("x'", (Nodetype.BASE, ("int32", 0)))],
+        [("x", (Nodetype.BASE, ("int32'", 0)))],
+        [("x", (Nodetype.NAME, "a/msg/B'"))],
+        [("x", (Nodetype.ARRAY, ((Nodetype.BASE, ("int32", 0)), -1)))],
+        [("x", (Nodetype.BASE, ("string", -1)))],
+    ):
+        with pytest.raises(DefinitionError):
+            check_types("a/msg/A", {"a/msg/A": fields, "a/msg/B'": []})
+
+
+def test_known_types_follow_their_distribution():
+    assert "seq" in dict(decoder_for_known(Wire.ROS1, "std_msgs/Header").fields["std_msgs/msg/Header"])
+    assert "seq" not in dict(decoder_for_known(Wire.CDR, "std_msgs/Header", "humble").fields["std_msgs/msg/Header"])
+    assert decoder_for_known(Wire.CDR, "my_pkg/Unheard") is None
+    assert decoder_for_known(Wire.CDR, "std_msgs/Header", "a_distribution_to_come") is not None
+
+
+IDL_OF_ROSIDL = """
+// generated from rosidl_adapter/resource/msg.idl.em
+#include "geometry_msgs/msg/Point.idl"
+
+module pkg {
+  module msg {
+    typedef double double__36[36];
+    module Outer_Constants {
+      @verbatim (language="comment", text="a ) in a comment" "\\n" "and \\" more")
+      const octet LIMIT = 7;
+      const string TEXT = "const long x = 1;";
+    };
+    @verbatim (language="comment", text=
+      "what it is for")
+    struct Outer {
+      @unit (value="m")
+      geometry_msgs::msg::Point point;
+      double__36 covariance;
+      sequence<uint8> data;
+      sequence<string<5>, Outer_Constants::LIMIT> names;
+      unsigned long long big; long long signed_big; unsigned short us; long l;
+      @default (value=3)
+      octet a, b[2];
+      Inner inner;
+      boolean flag;
+    };
+  };
+};
+"""
+
+
+def test_idl_as_rosidl_generates_it():
+    base, name, array, sequence = Nodetype.BASE, Nodetype.NAME, Nodetype.ARRAY, Nodetype.SEQUENCE
+    separator = "=" * 80
+    text = (
+        f"{separator}\nIDL: pkg/msg/Outer\n{IDL_OF_ROSIDL}\n"
+        f"{separator}\nIDL: geometry_msgs/msg/Point\nmodule geometry_msgs {{ module msg {{ struct Point {{ double x; }}; }}; }};\n"
+        f"{separator}\nIDL: pkg/msg/Inner\nmodule pkg {{ module msg {{ struct Inner {{ /* a comment */ float y; }}; }}; }};\n"
+    )
+    read = read_definition("pkg/msg/Outer", text, "idl")
+    assert dict(read.fields["pkg/msg/Outer"]) == {
+        "point": (name, "geometry_msgs/msg/Point"),
+        "covariance": (array, ((base, ("float64", 0)), 36)),
+        "data": (sequence, ((base, ("uint8", 0)), 0)),
+        "names": (sequence, ((base, ("string", 5)), 7)),
+        "big": (base, ("uint64", 0)),
+        "signed_big": (base, ("int64", 0)),
+        "us": (base, ("uint16", 0)),
+        "l": (base, ("int32", 0)),
+        "a": (base, ("byte", 0)),
+        "b": (array, ((base, ("byte", 0)), 2)),
+        "inner": (name, "pkg/msg/Inner"),
+        "flag": (base, ("bool", 0)),
+    }
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "module a {" * 100_00,
+        "/* " * 50_000,
+        '"' * 100_001,
+        "module pkg { module msg { struct T { " + "sequence<" * 5000,
+        "module pkg { module msg { const long A = " + "(" * 5000,
+        "module pkg { module msg { typedef T T; struct T { T t; }; }; };",
+        "module pkg { module msg { struct T { enum x; }; }; };",
+        "module pkg { module msg { union T switch (long) { case 1: long x; }; }; };",
+        "module pkg { module msg { struct T { long x[2][2]; }; }; };",
+        "module pkg { module msg { struct T { long x[N]; }; }; };",
+        "module pkg { module msg { struct T : U { long x; }; }; };",
+        "@" * 1000,
+        "@a(" * 10_000,
+        "é",
+    ],
+    ids=range(14),
+)
+@pytest.mark.timeout(10)
+def test_hostile_idl_is_refused_quickly(text):
+    with pytest.raises(DefinitionError):
+        read_definition("pkg/T", text, "idl")
+
+
+@pytest.mark.timeout(10)
+def test_constants_in_idl_are_not_computed():
+    # Each of these makes a parser that evaluates or backtracks run for hours.
+    for value in ("1 << 99999999999999", "(" * 200 + "1" + ")" * 200, "9" * 100_000):
+        text = f"module pkg {{ module msg {{ const long A = {value}; struct T {{ long x; }}; }}; }};"
+        assert read_definition("pkg/T", text, "idl").smallest["pkg/msg/T"] == 4
