@@ -2,7 +2,12 @@
 
 Names are the standard's: A the initiator, B the responder; d, P long-term, r, R
 ephemeral keys; x~ = 2^w + (x mod 2^w) with w = ceil(ceil(log2 n)/2) - 1; U = V the
-shared point; K the key; S_A, S_B the confirmations, S_B = S1 with 02, S_A = S2 with 03.
+shared point; K the key; S_B = S1 and S_A = S2 the confirmations. A1-A10 and B1-B10 mark
+the steps (6.1).
+
+A run that was not confirmed has agreed with whoever holds the peer's private key, or with
+nobody; confirmation tells which. The exchange authenticates keys: that a key is the peer's
+is for the caller to know, by a certificate.
 """
 
 from __future__ import annotations
@@ -42,7 +47,24 @@ def shared_point(curve: Curve, d: int, r: int, R: Point, peer_P: Point, peer_R: 
 
 
 class KeyExchange:
-    """One party's side of one run; both sides then hold the same key, and know it once confirmed."""
+    """One party's side of one run of the key exchange.
+
+    own_key, own_uid: one's own key and distinguishing identifier; peer_public, peer_uid: the peer's.
+    Identifiers have at most 8191 bytes (InvalidLength). initiator: True for A, False for B.
+    ephemeral_key: r, drawn afresh if None; never use one twice.
+
+    Each side sends `ephemeral`, calls `agree` once with what it received, sends the
+    confirmation and calls `confirm` with the peer's. Another order is OutOfOrder.
+
+    >>> from smcrypto.sm2 import KeyExchange, PrivateKey
+    >>> a, b = PrivateKey.generate(), PrivateKey.generate()
+    >>> robot = KeyExchange(a, b"robot", b.public_key, b"server", initiator=True)
+    >>> server = KeyExchange(b, b"server", a.public_key, b"robot", initiator=False)
+    >>> key, s_b = server.agree(robot.ephemeral, 16)
+    >>> same, s_a = robot.agree(server.ephemeral, 16)
+    >>> robot.confirm(s_b), server.confirm(s_a), key == same
+    (None, None, True)
+    """
 
     __slots__ = ("_curve", "_ephemeral", "_ephemeral_key", "_expected", "_initiator", "_own", "_peer", "_z")
 
@@ -81,18 +103,23 @@ class KeyExchange:
 
     @property
     def ephemeral(self) -> bytes:
-        """R, to be sent to the peer: 04 || x || y, 65 bytes."""
+        """One's own R, to be sent to the peer: 04 || x || y, 65 bytes."""
         return encode_point(self._ephemeral, self._curve)
 
     def agree(self, peer_ephemeral: BytesLike, length: int) -> tuple[bytes, bytes]:
-        """(key, confirmation to send)."""
+        """(key, confirmation): `length` bytes of shared key, and 32 bytes for the peer's `confirm`, S_A or S_B.
+
+        peer_ephemeral: the peer's R, 04 || x || y; InvalidKey if it is no point of the curve, or if the
+        shared point is at infinity; the exchange then is as before. length: at least 1, else InvalidLength.
+        OutOfOrder if it has agreed already.
+        """
         data = as_bytes(peer_ephemeral, "peer_ephemeral")
         if not isinstance(length, int) or isinstance(length, bool):
             raise TypeError(f"length must be an int, not {type(length).__name__}")
         if not 1 <= length < 32 * (2**32 - 1):
             raise InvalidLength(f"length must be at least 1 byte and below 32 * (2**32 - 1), not {length}")
         if self._ephemeral_key is None:
-            raise OutOfOrder("this exchange has agreed on a key already")
+            raise OutOfOrder("this exchange has agreed on a key already; every run needs its own")
         curve = self._curve
         peer_R = decode_point(data, curve, allow_compressed=False)
         peer_P = self._peer.point
@@ -112,10 +139,13 @@ class KeyExchange:
         return key, own
 
     def confirm(self, peer_confirmation: BytesLike) -> None:
-        """Return if the peer holds the same key; ConfirmationError otherwise."""
+        """Return if the peer's confirmation shows that it holds the same key; else ConfirmationError.
+
+        After ConfirmationError the key must not be used. OutOfOrder before `agree`, and at a second try.
+        """
         data = as_bytes(peer_confirmation, "peer_confirmation")
         if self._expected is None:
-            raise OutOfOrder("confirm follows agree, once")
+            raise OutOfOrder("confirm comes after agree, and once")
         expected, self._expected = self._expected, None
         if not compare_digest(expected, data):
             raise ConfirmationError("the peer did not arrive at the same key")

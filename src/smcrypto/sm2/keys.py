@@ -1,4 +1,11 @@
-"""SM2 keys, and what they do: sign, verify, encrypt, decrypt (GB/T 32918.1, 6)."""
+"""SM2 keys, GB/T 32918.1-2016, clause 6, and what is done with one key: sign, verify, encrypt, decrypt.
+
+Here input is checked and made bytes, encodings are chosen, nonces are drawn; the
+arithmetic is in signature and encryption. Both kinds of key are immutable.
+
+Which curve: sm2p256v1 always, unless the constructor is given another one, as
+tests do with the standards' sample curve.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +16,12 @@ from typing import Any, Literal, NoReturn
 from smcrypto import sm3
 from smcrypto.errors import InvalidKey
 from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
-from smcrypto.sm2 import encryption, signature
+from smcrypto.sm2 import encryption
+from smcrypto.sm2 import signature as signatures
 from smcrypto.sm2.curve import SM2P256V1, Curve, Point, decode_point, encode_point, require_point
 from smcrypto.sm2.nonces import hedged_nonces
 from smcrypto.sm2.points import base_comb, secret_sum, to_affine_all
+from smcrypto.sm2.signature import DEFAULT_UID
 
 __all__ = ["PrivateKey", "PublicKey"]
 
@@ -21,7 +30,14 @@ CiphertextEncoding = Literal["der", "c1c3c2", "c1c2c3"]
 
 
 class PublicKey:
-    """A point P_A of the curve: verifies and encrypts."""
+    """A public key P_A: verifies signatures, encrypts.
+
+    Made by `from_bytes`, `from_pem`, `from_der`, or found as `PrivateKey.public_key`. The constructor
+    takes the point (x, y); InvalidKey unless it is a point of `curve`. Two keys are equal if their points are.
+
+    >>> PublicKey.from_bytes(PrivateKey.from_int(1).public_key.to_bytes()).point == SM2P256V1.G
+    True
+    """
 
     __slots__ = ("_curve", "_point")
     _curve: Curve
@@ -40,38 +56,76 @@ class PublicKey:
 
     @classmethod
     def from_bytes(cls, data: BytesLike) -> PublicKey:
+        """The key that is encoded as a point (SEC 1, 2.3.4; GB/T 32918.1, 4.2.10).
+
+        data: 65 bytes 04 || x || y, or 33 bytes 02 or 03 || x. InvalidKey for anything else: another
+        length, the hybrid forms 06 and 07, infinity, x or y not below p, a point off the curve.
+
+        >>> key = PrivateKey.generate().public_key
+        >>> PublicKey.from_bytes(key.to_bytes(compressed=True)) == key
+        True
+        """
         return cls(decode_point(as_bytes(data, "data"), SM2P256V1))
 
     @classmethod
     def from_pem(cls, data: BytesLike) -> PublicKey:
+        """The key of a PEM file, label PUBLIC KEY (SubjectPublicKeyInfo, RFC 5480). InvalidKey if it is not one.
+
+        >>> key = PrivateKey.generate().public_key
+        >>> PublicKey.from_pem(key.to_pem()) == key
+        True
+        """
         from smcrypto.sm2 import keyfiles
 
         return cls.from_bytes(keyfiles.load_public(as_bytes(data, "data"), form="pem"))
 
     @classmethod
     def from_der(cls, data: BytesLike) -> PublicKey:
+        """The key of a SubjectPublicKeyInfo in DER. InvalidKey if it is not one.
+
+        >>> key = PrivateKey.generate().public_key
+        >>> PublicKey.from_der(key.to_der()) == key
+        True
+        """
         from smcrypto.sm2 import keyfiles
 
         return cls.from_bytes(keyfiles.load_public(as_bytes(data, "data"), form="der"))
 
     @property
     def point(self) -> Point:
-        """(x, y)."""
+        """(x, y), the affine coordinates."""
         return self._point
 
     @property
     def curve(self) -> Curve:
+        """The curve the key is on."""
         return self._curve
 
     def to_bytes(self, compressed: bool = False) -> bytes:
+        """The point, 04 || x || y in 65 bytes, or compressed, 02 or 03 || x in 33 (GB/T 32918.1, 4.2.9).
+
+        >>> key = PrivateKey.from_int(1).public_key
+        >>> len(key.to_bytes()), key.to_bytes(compressed=True).hex()[:16]
+        (65, '0232c4ae2c1f1981')
+        """
         return encode_point(self._point, self._curve, compressed=compressed)
 
     def to_pem(self) -> bytes:
+        """SubjectPublicKeyInfo as PEM, label PUBLIC KEY.
+
+        >>> PrivateKey.generate().public_key.to_pem().splitlines()[0]
+        b'-----BEGIN PUBLIC KEY-----'
+        """
         from smcrypto.sm2 import keyfiles
 
         return keyfiles.dump_public(self._standard_bytes(), form="pem")
 
     def to_der(self) -> bytes:
+        """SubjectPublicKeyInfo as DER: 91 bytes.
+
+        >>> len(PrivateKey.generate().public_key.to_der())
+        91
+        """
         from smcrypto.sm2 import keyfiles
 
         return keyfiles.dump_public(self._standard_bytes(), form="der")
@@ -83,26 +137,59 @@ class PublicKey:
 
     def verify(
         self,
-        signature_: BytesLike,
+        signature: BytesLike,
         message: BytesLike,
         *,
-        uid: BytesLike = signature.DEFAULT_UID,
+        uid: BytesLike = DEFAULT_UID,
         encoding: SignatureEncoding = "der",
     ) -> None:
-        data = as_bytes(message, "message")
-        e = signature.message_digest(self._curve, self._point, as_bytes(uid, "uid"), data)
-        self.verify_digest(signature_, e, encoding=encoding)
+        """Return if `signature` is this key's for `message` and `uid`; else InvalidSignature (GB/T 32918.2, 7).
 
-    def verify_digest(self, signature_: BytesLike, e: BytesLike, *, encoding: SignatureEncoding = "der") -> None:
-        signature.require_encoding(encoding)
-        r, s = signature.decode_signature(as_bytes(signature_, "signature"), self._curve, encoding)
+        uid: the signer's distinguishing identifier, at most 8191 bytes (InvalidLength); may be empty.
+        encoding: "der", SEQUENCE { r, s } in strict DER, or "raw", r || s in 64 bytes; else InvalidOption.
+        A malformed signature fails as a wrong one does.
+
+        >>> key = PrivateKey.generate()
+        >>> key.public_key.verify(key.sign(b"message"), b"message")
+        >>> key.public_key.verify(key.sign(b"message"), b"massage")
+        Traceback (most recent call last):
+        ...
+        smcrypto.errors.InvalidSignature: the signature does not hold
+        """
+        data = as_bytes(message, "message")
+        e = signatures.message_digest(self._curve, self._point, as_bytes(uid, "uid"), data)
+        self.verify_digest(signature, e, encoding=encoding)
+
+    def verify_digest(self, signature: BytesLike, e: BytesLike, *, encoding: SignatureEncoding = "der") -> None:
+        """As `verify`, for a caller who has e = SM3(Z_A || M) already (GB/T 32918.2, 7.1 from B5 on).
+
+        e: 32 bytes, else InvalidLength. It must be the hash with Z_A in it, not of the message alone.
+
+        >>> key, e = PrivateKey.generate(), bytes(32)
+        >>> key.public_key.verify_digest(key.sign_digest(e, encoding="raw"), e, encoding="raw")
+        """
+        signatures.require_encoding(encoding)
+        encoded = as_bytes(signature, "signature")
         digest = as_exact_bytes(e, "e", 32)
-        signature.verify(self._curve, self._point, int.from_bytes(digest, "big"), r, s)
+        r, s = signatures.decode_signature(encoded, self._curve, encoding)
+        signatures.verify(self._curve, self._point, int.from_bytes(digest, "big"), r, s)
 
     def encrypt(self, message: BytesLike, *, encoding: CiphertextEncoding = "der") -> bytes:
+        """`message` for the holder of the private key (GB/T 32918.4, 6).
+
+        message: any length, empty too; kept in memory. For more than a few KiB encrypt a key, and the data with it.
+        encoding: "der" (GM/T 0009: SEQUENCE { x1, y1, C3, C2 }), "c1c3c2" (GB/T 32918.4-2016: 97 bytes longer
+        than the message, starting with 04), or "c1c2c3" (the order of 2010); else InvalidOption.
+
+        >>> key = PrivateKey.generate()
+        >>> key.decrypt(key.public_key.encrypt(b"secret"))
+        b'secret'
+        """
         encryption.require_encoding(encoding)
         data = as_bytes(message, "message")
-        nonces = hedged_nonces(self._curve.n, b"SM2 encryption", self.to_bytes(), sm3.digest(data))
+        nonces = hedged_nonces(
+            self._curve.n, b"SM2 encryption", self.to_bytes(compressed=True), sm3.digest(data)
+        )
         return encryption.encode_ciphertext(
             *encryption.encrypt(self._curve, self._point, data, nonces), self._curve, encoding
         )
@@ -123,7 +210,12 @@ class PublicKey:
 
 
 class PrivateKey:
-    """A number d_A in [1, n-2]: signs and decrypts."""
+    """A private key d_A: signs, decrypts, takes part in a key exchange.
+
+    Made by `generate`, `from_int`, `from_bytes`, `from_pem` or `from_der`. The constructor takes d;
+    InvalidKey unless 1 <= d <= n-2 (GB/T 32918.1, 6.1). It shows no secret in its repr, is compared in
+    constant time, and is not pickled: that would write the key where nobody looks for one.
+    """
 
     __slots__ = ("_curve", "_d", "_inverse", "_public_key")
     _curve: Curve
@@ -146,14 +238,31 @@ class PrivateKey:
 
     @classmethod
     def generate(cls, curve: Curve = SM2P256V1) -> PrivateKey:
+        """A new key from the operating system's random source (GB/T 32918.1, 6.1).
+
+        >>> PrivateKey.generate() == PrivateKey.generate()
+        False
+        """
         return cls(secrets.randbelow(curve.n - 2) + 1, curve)
 
     @classmethod
     def from_int(cls, d: int) -> PrivateKey:
+        """The key d, 1 <= d <= n-2, else InvalidKey.
+
+        >>> PrivateKey.from_int(0)
+        Traceback (most recent call last):
+        ...
+        smcrypto.errors.InvalidKey: a private key must be in [1, n-2]
+        """
         return cls(d)
 
     @classmethod
     def from_bytes(cls, data: BytesLike) -> PrivateKey:
+        """The key d in 32 bytes, most significant first; InvalidKey for another length or range.
+
+        >>> PrivateKey.from_bytes(bytes(31) + b"\\x05").to_int()
+        5
+        """
         raw = as_bytes(data, "data")
         if len(raw) != SM2P256V1.scalar_bytes:
             raise InvalidKey(f"a private key has {SM2P256V1.scalar_bytes} bytes, not {len(raw)}")
@@ -161,22 +270,39 @@ class PrivateKey:
 
     @classmethod
     def from_pem(cls, data: BytesLike, password: BytesLike | None = None) -> PrivateKey:
+        """The key of a PEM file: PKCS#8 (RFC 5958), encrypted or not, or SEC1 (RFC 5915).
+
+        password: bytes, for an encrypted key and only for one. InvalidKey if the file is no SM2 key, the
+        password is wrong, missing or superfluous; MissingDependency if its cipher needs a package.
+
+        >>> key = PrivateKey.generate()
+        >>> PrivateKey.from_pem(key.to_pem(b"password"), b"password") == key
+        True
+        """
         from smcrypto.sm2 import keyfiles
 
         return cls(keyfiles.load_private(as_bytes(data, "data"), _password(password), form="pem"))
 
     @classmethod
     def from_der(cls, data: BytesLike, password: BytesLike | None = None) -> PrivateKey:
+        """As `from_pem`, from DER.
+
+        >>> key = PrivateKey.generate()
+        >>> PrivateKey.from_der(key.to_der(format="sec1")) == key
+        True
+        """
         from smcrypto.sm2 import keyfiles
 
         return cls(keyfiles.load_private(as_bytes(data, "data"), _password(password), form="der"))
 
     @property
     def curve(self) -> Curve:
+        """The curve the key is for."""
         return self._curve
 
     @property
     def public_key(self) -> PublicKey:
+        """P_A = [d_A]G, computed once."""
         known = self._public_key
         if known is None:
             [point] = to_affine_all([secret_sum(self._curve, (self._d, base_comb(self._curve)))], self._curve)
@@ -195,40 +321,89 @@ class PrivateKey:
         return known
 
     def to_int(self) -> int:
+        """d itself: secret.
+
+        >>> PrivateKey.from_int(5).to_int()
+        5
+        """
         return self._d
 
     def to_bytes(self) -> bytes:
+        """d in 32 bytes, most significant first: secret.
+
+        >>> PrivateKey.from_int(5).to_bytes().hex()[-4:]
+        '0005'
+        """
         return self._d.to_bytes(self._curve.scalar_bytes, "big")
 
     def to_pem(self, password: BytesLike | None = None, format: Literal["pkcs8", "sec1"] = "pkcs8") -> bytes:
-        from smcrypto.sm2 import keyfiles
+        """The key as PEM: secret unless a password encrypts it.
 
-        return keyfiles.dump_private(
-            self._d, self.public_key._standard_bytes(), _password(password), format, form="pem"
-        )
+        format: "pkcs8" (RFC 5958; label PRIVATE KEY, or ENCRYPTED PRIVATE KEY with a password: PBES2 with
+        SM4-CBC and PBKDF2-HMAC-SM3), or "sec1" (RFC 5915, EC PRIVATE KEY), which takes no password (InvalidOption).
+
+        >>> PrivateKey.generate().to_pem(b"password").splitlines()[0]
+        b'-----BEGIN ENCRYPTED PRIVATE KEY-----'
+        """
+        return self._dump(password, format, "pem")
 
     def to_der(self, password: BytesLike | None = None, format: Literal["pkcs8", "sec1"] = "pkcs8") -> bytes:
+        """As `to_pem`, as DER.
+
+        >>> key = PrivateKey.generate()
+        >>> PrivateKey.from_der(key.to_der()) == key
+        True
+        """
+        return self._dump(password, format, "der")
+
+    def _dump(
+        self, password: BytesLike | None, format: Literal["pkcs8", "sec1"], form: Literal["pem", "der"]
+    ) -> bytes:
         from smcrypto.sm2 import keyfiles
 
         return keyfiles.dump_private(
-            self._d, self.public_key._standard_bytes(), _password(password), format, form="der"
+            self._d, self.public_key._standard_bytes(), _password(password), format, form=form
         )
 
     def sign(
-        self, message: BytesLike, *, uid: BytesLike = signature.DEFAULT_UID, encoding: SignatureEncoding = "der"
+        self, message: BytesLike, *, uid: BytesLike = DEFAULT_UID, encoding: SignatureEncoding = "der"
     ) -> bytes:
+        """This key's signature of `message` (GB/T 32918.2, 6).
+
+        uid: the signer's distinguishing identifier, at most 8191 bytes (InvalidLength); may be empty.
+        encoding: "der", SEQUENCE { r, s }, 8 to 72 bytes, or "raw", r || s, 64 bytes; else InvalidOption.
+
+        >>> key = PrivateKey.generate()
+        >>> len(key.sign(b"message", uid=b"robot_1", encoding="raw"))
+        64
+        """
         data = as_bytes(message, "message")
-        e = signature.message_digest(self._curve, self.public_key.point, as_bytes(uid, "uid"), data)
+        e = signatures.message_digest(self._curve, self.public_key.point, as_bytes(uid, "uid"), data)
         return self.sign_digest(e, encoding=encoding)
 
     def sign_digest(self, e: BytesLike, *, encoding: SignatureEncoding = "der") -> bytes:
-        signature.require_encoding(encoding)
+        """As `sign`, for a caller who has e = SM3(Z_A || M) already (GB/T 32918.2, 6.1 from A3 on).
+
+        e: 32 bytes, else InvalidLength. It must be the hash with Z_A in it, not of the message alone.
+
+        >>> len(PrivateKey.generate().sign_digest(bytes(32), encoding="raw"))
+        64
+        """
+        signatures.require_encoding(encoding)
         digest = as_exact_bytes(e, "e", 32)
         nonces = hedged_nonces(self._curve.n, b"SM2 signature", self.to_bytes(), digest)
-        r, s = signature.sign(self._curve, self._d_plus_1_inverse(), int.from_bytes(digest, "big"), nonces)
-        return signature.encode_signature(r, s, self._curve, encoding)
+        r, s = signatures.sign(self._curve, self._d_plus_1_inverse(), int.from_bytes(digest, "big"), nonces)
+        return signatures.encode_signature(r, s, self._curve, encoding)
 
     def decrypt(self, ciphertext: BytesLike, *, encoding: CiphertextEncoding = "der") -> bytes:
+        """The message in `ciphertext`, or InvalidCiphertext, whatever is wrong with it (GB/T 32918.4, 7).
+
+        encoding: "der", "c1c3c2" or "c1c2c3" as in `PublicKey.encrypt`; else InvalidOption. C1 must be uncompressed.
+
+        >>> key = PrivateKey.generate()
+        >>> key.decrypt(key.public_key.encrypt(b"", encoding="c1c3c2"), encoding="c1c3c2")
+        b''
+        """
         encryption.require_encoding(encoding)
         parts = encryption.decode_ciphertext(as_bytes(ciphertext, "ciphertext"), self._curve, encoding)
         return encryption.decrypt(self._curve, self._d, *parts)
