@@ -82,9 +82,7 @@ class SM3:
     block_size: ClassVar[int] = 64
 
     def __init__(self, data: BytesLike = b"") -> None:
-        self._state = _EMPTY.copy()
-        if data != b"":
-            self._state.update(as_bytes(data, "data"))
+        self._state = _started(as_bytes(data, "data"))
 
     def update(self, data: BytesLike, /) -> None:
         """Append `data` to the message; as often as one likes, also after `digest`."""
@@ -119,9 +117,7 @@ def digest(data: BytesLike) -> bytes:
     >>> digest(b"").hex()[:16]
     '1ab21d8355cfa17f'
     """
-    state = _EMPTY.copy()
-    state.update(as_bytes(data, "data"))
-    return state.digest()
+    return _started(as_bytes(data, "data")).digest()
 
 
 def hmac(key: BytesLike, data: BytesLike) -> bytes:

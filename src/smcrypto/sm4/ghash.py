@@ -1,0 +1,253 @@
+"""GHASH, the universal hash under GCM: NIST SP 800-38D, 6.3 and 6.4.
+
+Notation: a block is an element of GF(2^128) = GF(2)[x] / (x^128 + x^7 + x^2 + x + 1), held as an integer whose
+bit 127 is the coefficient of x^0 (the order of 6.3). Multiplying by x is therefore a shift to the right.
+GHASH(X_1 ... X_m) = X_1·H^m + X_2·H^(m-1) + ... + X_m·H, and + is XOR.
+
+    by definition   6.3 and 6.4 as they are written: the tests' oracle
+    serial          (Y + X_i)·H, a block at a time, over one table of 256 multiples of H: 8 µs to make,
+                    some 0.9 µs a block. For short messages and for keys that are used once.
+    folding         turns a message into one of 8, 32 or 128 blocks with the same GHASH, 0.05 µs a block
+                    where the message is long; that one is then hashed. See `_Fold`.
+
+Side channels: `serial` indexes its table by bytes of Y + X_i, `_Fold` its tables by bits of powers of H, so the
+addresses both touch depend on the authentication key. Big integers take no data-dependent branches in either.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+__all__ = ["GHASH", "ghash_by_definition", "multiply_by_definition"]
+
+_R = 0xE1 << 120  # x^128 = 1 + x + x^2 + x^7
+_ONE = 1 << 127  # x^0
+
+
+def multiply_by_definition(X: int, Y: int) -> int:
+    """X·Y, SP 800-38D, 6.3, algorithm 1."""
+    Z, V = 0, Y
+    for i in range(128):
+        if X >> (127 - i) & 1:
+            Z ^= V
+        V = V >> 1 ^ _R if V & 1 else V >> 1
+    return Z
+
+
+def ghash_by_definition(H: int, data: bytes) -> int:
+    """GHASH_H of whole blocks, SP 800-38D, 6.4, algorithm 2."""
+    Y = 0
+    for i in range(0, len(data), 16):
+        Y = multiply_by_definition(Y ^ int.from_bytes(data[i : i + 16], "big"), H)
+    return Y
+
+
+# --- one table, one block at a time ----------------------------------------------------------------------------
+
+
+def _multiples(H: int) -> list[int]:
+    """T[b] = b·H for the 256 polynomials b of degree below 8; b's bit 7 is x^0, as in a block's first byte."""
+    powers = []  # x^0·H ... x^7·H
+    for _ in range(8):
+        powers.append(H)
+        H = H >> 1 ^ _R if H & 1 else H >> 1
+    T = [0]
+    for V in reversed(powers):
+        T += [V ^ W for W in T]
+    return T
+
+
+_M120 = (1 << 120) - 1
+
+
+def _serial(T: list[int], data: bytes) -> int:
+    """GHASH of whole blocks with T = _multiples(H).
+
+    (Y + X)·H is the sum of T[byte i]·x^(8i): 248 bits, x^0 being bit 247. The low 120 bits stand for
+    x^128 and above; x^128 = 1 + x + x^2 + x^7 brings them back, and since they end eight places
+    before x^255 once is enough.
+    """
+    Y = 0
+    from_bytes = int.from_bytes
+    for i in range(0, len(data), 16):
+        a, b, c, d, e, f, g, h, s, t, u, v, w, x, y, z = (Y ^ from_bytes(data[i : i + 16], "big")).to_bytes(16, "big")
+        P = T[a] << 8 ^ T[b]
+        P = P << 8 ^ T[c]
+        P = P << 8 ^ T[d]
+        P = P << 8 ^ T[e]
+        P = P << 8 ^ T[f]
+        P = P << 8 ^ T[g]
+        P = P << 8 ^ T[h]
+        P = P << 8 ^ T[s]
+        P = P << 8 ^ T[t]
+        P = P << 8 ^ T[u]
+        P = P << 8 ^ T[v]
+        P = P << 8 ^ T[w]
+        P = P << 8 ^ T[x]
+        P = P << 8 ^ T[y]
+        P = P << 8 ^ T[z]
+        low = (P & _M120) << 8
+        Y = P >> 120 ^ low ^ low >> 1 ^ low >> 2 ^ low >> 7
+    return Y
+
+
+def _times(T: list[int], X: int) -> int:
+    """X·H with T = _multiples(H)."""
+    return _serial(T, X.to_bytes(16, "big"))
+
+
+def _square(X: int) -> int:
+    """X²: squaring puts a zero between any two coefficients, which is reading the bits as digits of base 4."""
+    P = int(f"{X:0128b}", 4) << 1  # 256 bits, x^0 on top
+    for _ in range(2):  # the first reduction leaves x^128 ... x^133
+        high = P >> 128 << 128
+        low = (P ^ high) << 128
+        P = high ^ low ^ low >> 1 ^ low >> 2 ^ low >> 7
+    return P >> 128
+
+
+# --- many blocks as one integer --------------------------------------------------------------------------------
+
+_GROUP = 5  # parts whose 2^5 sums are tabulated together: (26 + 128) / 5 additions a part, the least there is
+_LOW_BITS = int.from_bytes(b"\x01" * 128, "big")
+
+
+class _Masks(NamedTuple):
+    """Of n lanes (n even), 128 bits each; a pair of lanes is a slot of 256 bits."""
+
+    upper: int  # the upper lane of every slot, that is blocks 0, 2, 4, ... of a part
+    lower: int  # the lower lanes, blocks 1, 3, 5, ...
+    spread: int  # the upper lanes of n slots
+
+
+@cache
+def _masks(n: int) -> _Masks:
+    slot = ((1 << 128) - 1 << 128).to_bytes(32, "big")
+    upper = int.from_bytes(slot * (n // 2), "big")
+    return _Masks(upper, upper >> 128, int.from_bytes(slot * n, "big"))
+
+
+class _Fold:
+    """Turns a message into n blocks with the same GHASH, for one H.
+
+    The message, in front of it zero blocks up to a multiple of n, is cut into parts V_J ... V_1, V_0 of n
+    blocks. A part is *one* integer of n lanes. Block l of all parts adds up to V_0 + V_1·H^n + V_2·H^2n + ...
+    in lane l, so the lanes all multiply by the same constants c_j = H^(n·j). With the bits of the constants
+    c_j = sum of c_jk·x^k, the sum over j of c_j·V_j is that of S_k·x^k for k = 0 ... 127, where
+
+        S_k = sum of those V_j that have c_jk = 1
+
+    which needs additions of whole parts only. Five parts have just 32 sums: they are made once, and each of
+    the 128 rows S_k takes one of them ("four Russians"). Which, says `_choices`: 128 bytes per five parts.
+    What is left are 128 shifts: S_0 + x·(S_1 + x·(S_2 + ...)) in lanes of 255 bits, and one reduction.
+
+    early: spread the lanes to 256 bits before the additions, which then have twice the length but no more
+    steps (right while parts are short), or after them.
+    """
+
+    __slots__ = ("_H_n", "_constants", "_early", "n")
+
+    def __init__(self, H: int, n: int, *, early: bool) -> None:
+        self.n = n
+        self._early = early
+        self._H_n = H
+        for _ in range(n.bit_length() - 1):
+            self._H_n = _square(self._H_n)
+        # The choices so far and the next constant; replaced as a whole, so that threads may share a key.
+        self._constants: tuple[list[bytes], int] = ([], _ONE)
+
+    def _choices(self, groups: int) -> list[bytes]:
+        """For at least so many groups: byte k of group g has bit i set where c_(5g+i),k is."""
+        known, c = self._constants
+        if len(known) >= groups:
+            return known
+        choices = known.copy()
+        T = _multiples(self._H_n)
+        while len(choices) < groups:
+            packed = 0
+            for i in range(_GROUP):
+                digits = f"{c:0128b}".encode()  # character k: coefficient of x^k
+                packed |= (int.from_bytes(digits, "big") & _LOW_BITS) << i
+                c = _times(T, c)
+            choices.append(packed.to_bytes(128, "big"))
+        self._constants = (choices, c)
+        return choices
+
+    def fold(self, data: bytes) -> bytes:
+        """n blocks with the GHASH of `data` (whole blocks, one at least)."""
+        n, early = self.n, self._early
+        width = 128 * n
+        upper, lower, spread = _masks(n)
+        size = 16 * n
+        count = -(-len(data) // size)
+        data = data.rjust(size * count, b"\0")
+        V = [int.from_bytes(data[i : i + size], "big") for i in range(size * (count - 1), -1, -size)]
+        if early:
+            V = [(v & upper) << width | (v & lower) << 128 for v in V]
+        groups = -(-count // _GROUP)
+        S: list[int] = []
+        for g, choice in zip(range(0, count, _GROUP), self._choices(groups), strict=False):
+            sums = [0]
+            for v in V[g : g + _GROUP]:
+                sums += [v ^ w for w in sums]
+            sums *= 1 << _GROUP - (len(sums).bit_length() - 1)  # parts that are not there add nothing
+            S = [s ^ sums[i] for s, i in zip(S, choice, strict=True)] if S else [sums[i] for i in choice]
+        if not early:
+            S = [(s & upper) << width | (s & lower) << 128 for s in S]
+        P = 0
+        for s in reversed(S):
+            P = P >> 1 ^ s
+        for _ in range(2):  # as in _square
+            high = P & spread
+            low = (P ^ high) << 128
+            P = high ^ low ^ low >> 1 ^ low >> 2 ^ low >> 7
+        P &= spread
+        return (P >> width | (P & (1 << width) - 1) >> 128).to_bytes(size, "big")
+
+
+# --- which, when -----------------------------------------------------------------------------------------------
+
+# (lanes, blocks from which to fold to so many). Measured by benchmarks/bench_sm4_aead.py.
+_FOLDS = ((128, 12288), (32, 768), (8, 28))
+_EARLY = 8  # lanes up to which spreading before the additions is the faster way
+_PIECE = 1 << 20  # bytes folded at once: bounds memory and the number of constants
+# A fold's constants take 30 µs to make, what 40 blocks take serially. They are made once a key has served so
+# many blocks; a key for one short message does not pay for them.
+_WORTH_CONSTANTS = 64
+
+
+class GHASH:
+    """GHASH under one key, quicker as the key serves longer.
+
+    H: the hash subkey, E(K, 0^128), 16 bytes. Tables are made when first needed: 13 KB, and from the second
+    kilobyte on some KB more; at most 27 KB for messages of a mebibyte.
+    """
+
+    __slots__ = ("_H", "_T", "_folds", "_served")
+
+    def __init__(self, H: bytes) -> None:
+        self._H = int.from_bytes(H, "big")
+        self._T = _multiples(self._H)
+        self._folds: dict[int, _Fold] = {}
+        self._served = 0
+
+    def __call__(self, data: bytes) -> int:
+        """GHASH of `data`, whole blocks."""
+        blocks = len(data) // 16
+        self._served += blocks
+        if self._served >= _WORTH_CONSTANTS:
+            for n, least in _FOLDS:
+                if blocks >= least:
+                    data = self._folded(n, data)
+                    blocks = n
+        return _serial(self._T, data)
+
+    def _folded(self, n: int, data: bytes) -> bytes:
+        fold = self._folds.get(n)
+        if fold is None:
+            fold = self._folds[n] = _Fold(self._H, n, early=n <= _EARLY)
+        folded = b""
+        for i in range(0, len(data), _PIECE):
+            folded = fold.fold(folded + data[i : i + _PIECE])
+        return folded
