@@ -45,9 +45,10 @@ class TopicRule:
 class Schedule:
     """Which messages of one topic are due, by their receive times.
 
-    The rate is kept by the generic cell rate algorithm (ITU-T I.371) with a
-    tolerance of half a period: a 10 Hz topic that jitters passes a rate of 10
-    undiminished, and no window of T seconds has more than rate * T + 1.5 records.
+    A rate makes records due every period; taken is the message nearest to that
+    moment, judged by the mean interval at which messages come. So a 10 Hz topic
+    that jitters passes a rate of 10 almost undiminished, a 100 Hz topic is thinned out
+    evenly, and no window of T seconds has more than rate * T + 1.5 records.
     """
 
     def __init__(self, rule: TopicRule) -> None:
@@ -58,6 +59,8 @@ class Schedule:
         self._done = False
         self._period = 0 if rule.rate is None else round(1e9 / rule.rate)
         self._next: int | None = None
+        self._latest: int | None = None
+        self._interval = 0.0
         self._set_end()
 
     @property
@@ -74,19 +77,24 @@ class Schedule:
             self._set_end()
         if self._end is not None and received_ns >= self._end:
             return False
-        if self._next is None or not self._period:
+        if not self._period:
             return True
-        early = self._next - received_ns
-        # After a step back of the clock the next one is more than 1.5 periods ahead, which it cannot be otherwise.
-        return 2 * early <= self._period or 2 * early > 3 * self._period
+        self._measure(received_ns)
+        return self._next is None or self._next - received_ns <= min(self._interval, self._period) / 2
 
     def captured(self, received_ns: int) -> None:
         """A due message became a record. One that could not be decoded does not count."""
         self._done = self._single
-        if self._period:
-            stepped_back = self._next is not None and 2 * (self._next - received_ns) > 3 * self._period
-            next_one = received_ns if self._next is None or stepped_back else max(self._next, received_ns)
-            self._next = next_one + self._period
+        self._next = max(self._next or received_ns, received_ns) + self._period
+
+    def _measure(self, received_ns: int) -> None:
+        """Keep the mean interval; begin anew when the clock stepped back."""
+        gap = 0 if self._latest is None else received_ns - self._latest
+        self._latest = received_ns
+        if gap < -self._period:
+            self._next, self._interval = None, 0.0
+        elif gap > 0:
+            self._interval += (gap - self._interval) / (8 if self._interval else 1)
 
     def _set_end(self) -> None:
         if self._start is not None and self._length is not None:
@@ -133,7 +141,7 @@ def _expression(pattern: str) -> str:
             parts.append(r"[^/]")
         else:
             parts.append(piece)  # literal characters, or a class, which reads the same in both notations
-    if "//" in pattern or not parts:
+    if "//" in pattern or pattern.endswith("/"):
         raise ValueError(f"{pattern!r} is not a name or pattern: it has an empty part")
     try:
         re.compile("".join(parts))

@@ -9,6 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for, decoder_for_known, read_definition
 from rosbridge_eth.capture.definitions import MAX_DEPTH, MAX_FIELDS, MAX_TEXT, check_types
 
@@ -173,7 +174,9 @@ def test_types_that_contain_themselves_are_refused():
 
 def test_deep_nesting_is_refused_and_reasonable_nesting_is_not():
     def nested(depth):
-        return definition(*[("" if i == 0 else f"a/T{i}\n") + f"T{i + 1} x" for i in range(depth)], f"a/T{depth}\nint8 x")
+        return definition(
+            *[("" if i == 0 else f"a/T{i}\n") + f"T{i + 1} x" for i in range(depth)], f"a/T{depth}\nint8 x"
+        )
 
     read_definition("a/T0", nested(MAX_DEPTH))
     with pytest.raises(DefinitionError, match="deep"):
@@ -205,7 +208,7 @@ def test_sizes_are_bounded():
 
 def test_a_constant_s_text_never_reaches_generated_code():
     marker = "test_marker_that_must_not_exist"
-    text = f"int32 x\nstring S=\"\"\"'); import sys; sys.{marker} = 1; ('\n"
+    text = f'int32 x\nstring S="""\'); import sys; sys.{marker} = 1; (\'\n'
     decoder = decoder_for(Wire.ROS1, "a/Constants", text)
     assert decoder.decode(b"\x07\x00\x00\x00").x == 7
     assert not hasattr(sys, marker)
@@ -292,11 +295,12 @@ module pkg {
 
 def test_idl_as_rosidl_generates_it():
     base, name, array, sequence = Nodetype.BASE, Nodetype.NAME, Nodetype.ARRAY, Nodetype.SEQUENCE
-    separator = "=" * 80
+    point = "module geometry_msgs { module msg { struct Point { double x; }; }; };"
+    inner = "module pkg { module msg { struct Inner { /* a comment */ float y; }; }; };"
     text = (
-        f"{separator}\nIDL: pkg/msg/Outer\n{IDL_OF_ROSIDL}\n"
-        f"{separator}\nIDL: geometry_msgs/msg/Point\nmodule geometry_msgs {{ module msg {{ struct Point {{ double x; }}; }}; }};\n"
-        f"{separator}\nIDL: pkg/msg/Inner\nmodule pkg {{ module msg {{ struct Inner {{ /* a comment */ float y; }}; }}; }};\n"
+        f"{SEPARATOR}\nIDL: pkg/msg/Outer\n{IDL_OF_ROSIDL}\n"
+        f"{SEPARATOR}\nIDL: geometry_msgs/msg/Point\n{point}\n"
+        f"{SEPARATOR}\nIDL: pkg/msg/Inner\n{inner}\n"
     )
     read = read_definition("pkg/msg/Outer", text, "idl")
     assert dict(read.fields["pkg/msg/Outer"]) == {
