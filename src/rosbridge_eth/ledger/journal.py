@@ -399,6 +399,12 @@ class Journal:
         rows = self._rows("SELECT state, count(*) FROM job WHERE kind = ? GROUP BY state", Kind.BATCH)
         return {State(state): number for state, number in rows}
 
+    def included(self, robot: bytes) -> int:
+        """How many of a robot's batches are known to be on the chain."""
+        sql = "SELECT count(*) FROM job WHERE kind = ? AND robot = ? AND state IN (?, ?, ?)"
+        states = (State.INCLUDED, State.CONFIRMED, State.ACKNOWLEDGED)
+        return int(self._rows(sql, Kind.BATCH, robot, *states)[0][0])
+
     def packed(self, job: Job) -> bytes:
         """The packed records of a batch; StoreError if they were pruned."""
         ((packed,),) = self._rows("SELECT records FROM job WHERE id = ?", job.id)
