@@ -68,6 +68,8 @@ class Certificate:
         if body.raw() != self._signed.algorithm:
             raise CertificateError("the two statements of the signature algorithm differ (RFC 5280, 4.1.1.2)")
         self._issuer = Name.read(body)
+        if not self._issuer:
+            raise CertificateError("the issuer's name is empty (RFC 5280, 4.1.2.4)")
         validity = body.sequence()
         self._not_before, self._not_after = validity.time(), validity.time()
         validity.finish()

@@ -89,6 +89,10 @@ def _names(names: str | Iterable[str] | None) -> tuple[str, ...]:
     return (names,) if isinstance(names, str) else tuple(names)
 
 
+class _GivenUp(CertificateError):
+    """A limit of the search was reached: no other path is tried."""
+
+
 class _Search:
     """One depth-first search; keeps the refusal that came furthest, which is the one worth telling."""
 
@@ -111,16 +115,14 @@ class _Search:
         self.every = every
         self.steps = 0
         self.signatures: dict[tuple[Certificate, Certificate], CertificateError | None] = {}
-        self.refusal: tuple[int, CertificateError] | None = None
+        self.refusal: tuple[float, CertificateError] = (0, CertificateError("no path was found"))
 
     def from_leaf(self, leaf: Certificate) -> tuple[Certificate, ...]:
         self.require_fit(leaf)
         path = self.extend((leaf,))
         if path is not None:
             return path
-        if self.refusal is not None:
-            raise self.refusal[1]
-        raise CertificateError(f"no issuer {leaf.issuer} is known for {leaf.subject}")
+        raise self.refusal[1]
 
     def extend(self, path: tuple[Certificate, ...]) -> tuple[Certificate, ...] | None:
         current = path[-1]
@@ -133,7 +135,7 @@ class _Search:
         for issuer in self.candidates:
             self.steps += 1
             if self.steps > _MAX_STEPS:
-                raise CertificateError(f"no path was found in {_MAX_STEPS} steps")
+                raise _GivenUp(f"no path was found in {_MAX_STEPS} steps")
             if not _may_have_issued(issuer, current) or any(_same_holder(issuer, other) for other in path):
                 continue
             found = True
@@ -141,6 +143,8 @@ class _Search:
                 self.require_fit(issuer)
                 _require_issuer(issuer, path)
                 self.require_signature(current, issuer)
+            except _GivenUp:
+                raise
             except CertificateError as error:
                 self.refused(path, error)
                 continue
@@ -149,7 +153,9 @@ class _Search:
                 return whole
         if not found:
             trusted = "trusted root" if current.subject == current.issuer else "known issuer"
-            self.refused(path, CertificateError(f"no {trusted} {current.issuer} for {current.subject}"))
+            # Says less than what was wrong with an issuer that is there.
+            missing = CertificateError(f"no {trusted} {current.issuer} for {current.subject}")
+            self.refused(path, missing, came=len(path) - 0.5)
         return None
 
     def unrevoked(self, path: tuple[Certificate, ...]) -> tuple[Certificate, ...] | None:
@@ -162,9 +168,12 @@ class _Search:
                 return None
         return path
 
-    def refused(self, path: tuple[Certificate, ...], error: CertificateError) -> None:
-        if self.refusal is None or len(path) > self.refusal[0]:
-            self.refusal = (len(path), error)
+    def refused(
+        self, path: tuple[Certificate, ...], error: CertificateError, *, came: float | None = None
+    ) -> None:
+        came = len(path) if came is None else came
+        if came > self.refusal[0]:
+            self.refusal = (came, error)
 
     def require_fit(self, certificate: Certificate) -> None:
         """What holds for every certificate of a path: validity (6.1.3 a 2), extensions (6.1.4 o), purposes."""
@@ -186,7 +195,7 @@ class _Search:
         pair = (certificate, issuer)
         if pair not in self.signatures:
             if len(self.signatures) >= _MAX_SIGNATURES:
-                raise CertificateError(f"no path was found with {_MAX_SIGNATURES} signatures")
+                raise _GivenUp(f"no path was found with {_MAX_SIGNATURES} signatures")
             try:
                 certificate.verify_signature(issuer, uid=self.uid)
                 self.signatures[pair] = None

@@ -1,20 +1,19 @@
 """Certificate extensions: RFC 5280, 4.2.
 
 An `Extension` keeps identifier, criticality and the bytes of its value. Those
-that this library understands (below, `UNDERSTOOD`) are read when the
+that this library understands are read when the
 certificate is, so that one which cannot be read is refused at once.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Final
 
 from smcrypto import der, sm3
-from smcrypto.errors import CertificateError, InvalidOption
+from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
 from smcrypto.x509.names import Name
 
 __all__ = [
@@ -63,7 +62,6 @@ _PURPOSES: Final = {
     "anyExtendedKeyUsage": "2.5.29.37.0",
 }
 _PURPOSE_NAMES: Final = {oid: name for name, oid in _PURPOSES.items()}
-_DOTTED: Final = re.compile(r"[0-2](\.(0|[1-9][0-9]*))+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +157,6 @@ def read_key_usage(value: bytes) -> frozenset[str]:
 
 def usage_names(names: Iterable[str]) -> frozenset[str]:
     """`names` under the names of this module; InvalidOption for one that is no key usage."""
-    if isinstance(names, str):
-        raise TypeError("key usages are a collection of names, not one str")
     wanted = set()
     for name in names:
         if name not in _KEY_USAGE_BITS:
@@ -190,8 +186,12 @@ def read_extended_key_usage(value: bytes) -> tuple[str, ...]:
 def usage_oid(purpose: str) -> str:
     """The identifier of a purpose given by name ("serverAuth") or as a dotted identifier."""
     oid = _PURPOSES.get(purpose, purpose)
-    if not _DOTTED.fullmatch(oid):
-        raise InvalidOption(f"unknown extended key usage {purpose!r}; a dotted object identifier names any other")
+    try:
+        der.oid(oid)
+    except InvalidEncoding:
+        raise InvalidOption(
+            f"unknown extended key usage {purpose!r}; a dotted object identifier names any other"
+        ) from None
     return oid
 
 
@@ -202,8 +202,6 @@ def purpose_name(purpose: str) -> str:
 
 
 def extended_key_usage(purposes: Iterable[str]) -> Extension:
-    if isinstance(purposes, str):
-        raise TypeError("extended key usages are a collection of names, not one str")
     return Extension(EXTENDED_KEY_USAGE, False, der.sequence(*(der.oid(usage_oid(p)) for p in purposes)))
 
 
@@ -293,8 +291,6 @@ def _read_general_name(reader: der.Reader) -> str:
 
 
 def subject_alt_names(names: Iterable[str], *, critical: bool) -> Extension:
-    if isinstance(names, str):
-        raise TypeError("subject alternative names are a collection of names, not one str")
     return Extension(SUBJECT_ALT_NAME, critical, der.sequence(*map(_general_name, names)))
 
 

@@ -41,7 +41,6 @@ _TYPES: Final = (
 )
 _BY_OID: Final = {oid: name for name, oid, _, _ in _TYPES}
 _BY_NAME: Final = {name.lower(): (oid, bound, tag) for name, oid, bound, tag in _TYPES}
-_DOTTED: Final = re.compile(r"[0-2](\.(0|[1-9][0-9]*))+")
 _PRINTABLE: Final = re.compile(r"[A-Za-z0-9 '()+,\-./:=?]*")  # X.680, 41.4
 # PrintableString is read more widely than X.680 allows, because CAs write "*", "@", "_" and "&" into it.
 _CODECS: Final = {
@@ -201,8 +200,10 @@ def _attribute(kind: str, text: str) -> Attribute:
     if not isinstance(kind, str) or not isinstance(text, str):
         raise TypeError("a name's types and values must be str")
     oid, bound, tag = _BY_NAME.get(kind.lower(), (kind, 32768, der.UTF8_STRING))
-    if not _DOTTED.fullmatch(oid):
-        raise InvalidOption(f"unknown attribute type {kind!r}; a dotted object identifier names any other")
+    try:
+        der.oid(oid)
+    except InvalidEncoding:
+        raise InvalidOption(f"unknown attribute type {kind!r}; a dotted object identifier names any other") from None
     if not 1 <= len(text) <= bound or (kind.upper() == "C" and len(text) != 2):
         limits = "exactly 2" if kind.upper() == "C" else f"1 to {bound}"
         raise InvalidOption(f"a name's {kind} must have {limits} characters, not {len(text)}")
@@ -212,8 +213,6 @@ def _attribute(kind: str, text: str) -> Attribute:
         return Attribute(oid, der.element(tag, text.encode(_CODECS[tag])), text)
     except UnicodeEncodeError:
         raise InvalidOption(f"a name's {kind} has a character that {_CODECS[tag]} cannot write") from None
-    except InvalidEncoding as error:
-        raise InvalidOption(str(error)) from None
 
 
 # --- RFC 4514 text ---
@@ -259,6 +258,8 @@ def _parse(text: str) -> list[tuple[Attribute, ...]]:
         if hexadecimal is not None:
             position = hexadecimal.end()
             rdn.append(_hex_attribute(kind[1], bytes.fromhex(hexadecimal[1])))
+        elif text.startswith("#", position):
+            raise InvalidOption("not a distinguished name of RFC 4514: a leading # must be escaped or precede hex")
         else:
             value, position = _parse_value(text, position)
             rdn.append(_attribute(kind[1], value))

@@ -138,9 +138,9 @@ class CertificateRevocationList:
         outer = der.Reader(self._signed.body)
         body = outer.sequence()
         outer.finish()
-        version = body.integer() if body.peek_tag() == der.INTEGER else 0
-        if version not in (0, 1) or (version == 0 and body.peek_tag() == der.INTEGER):
-            raise CertificateError(f"revocation list version {version + 1}")
+        version_2 = body.peek_tag() == der.INTEGER
+        if version_2 and body.integer() != 1:
+            raise CertificateError("a revocation list of a version other than 1 and 2")
         if body.raw() != self._signed.algorithm:
             raise CertificateError("the two statements of the signature algorithm differ (RFC 5280, 5.1.1.2)")
         self._issuer = Name.read(body)
@@ -152,7 +152,7 @@ class CertificateRevocationList:
         if body.peek_tag() == der.SEQUENCE:
             self._read_entries(body.sequence())
         self._extensions: tuple[ext.Extension, ...] = ()
-        if body.has_explicit(0) and version == 1:
+        if body.has_explicit(0) and version_2:
             wrapped = body.explicit(0)
             self._extensions = ext.read_extensions(wrapped)
             wrapped.finish()
@@ -296,7 +296,9 @@ def check_revocation(
             known = True
             entry = crl.find(certificate.serial_number)
             if entry is not None:
-                raise CertificateRevokedError(f"{certificate.subject} was revoked at {entry.revoked_at}: {entry.reason}")
+                raise CertificateRevokedError(
+                    f"{certificate.subject} was revoked at {entry.revoked_at}: {entry.reason}"
+                )
         if not known and problem is not None:
             raise problem
         if not known and (every or position == 0):
