@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
-from rosbridge_eth.capture import RawMessage
+from rosbridge_eth.capture import Decoder, RawMessage
 
 Emit: TypeAlias = Callable[[RawMessage], None]
 """Takes a message; may block, which slows a bag or a simulation down (a live source drops instead)."""
@@ -35,6 +35,9 @@ class Source(Protocol):
 
     def offers(self) -> Sequence[Offer]:
         """The topics there are now, sorted by name. Raises SourceError."""
+
+    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
+        """The decoders of the chosen topics as far as they are known before the first message; a live source: none."""
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit messages in receive order until the source ends or `stop` is set. Raises SourceError."""

@@ -1,0 +1,283 @@
+"""What an operator does: make a home, deploy the contract, enrol and revoke, look after accounts.
+
+Functions on an operator's home and a chain; the command line asks for
+passphrases and prints. Every step that spans the registry, a file and the
+chain is ordered so that it can be run again after a crash between any two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from rosbridge_eth.bundle import Bundle, seal_bundle
+from rosbridge_eth.config import ServerConfig, load_server_config
+from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.home import Deployment, OperatorHome, write_atomically
+from rosbridge_eth.identity import (
+    CertificateAuthority,
+    Identity,
+    PeerIdentity,
+    Role,
+    Trust,
+    check_name,
+    create_ca,
+    enrol,
+    enrol_requests,
+    identity_files,
+    load_identity,
+    read_certificates,
+    save_identity,
+)
+from rosbridge_eth.ledger import Chain, Contract, deploy
+from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.ledger.journal import Binding
+from rosbridge_eth.reading import join_certificates
+from rosbridge_eth.records import robot_id
+from rosbridge_eth.registry import Enrolment, Registry
+from smcrypto import InvalidKey, sm2, x509
+
+OWNER = "owner"
+_WEI = 10**18
+
+
+def server_toml(listen: str, public: str | None, chain_url: str, name: str) -> str:
+    """The first server.toml of a home: what differs from the defaults, and where the rest is described."""
+    lines = [
+        "# Settings of the server; docs/configuration.md describes every key.",
+        f'listen = "{listen}"',
+        *([f'public = "{public}"'] if public else ['# public = "HOST:PORT"  # the address robots are given']),
+        f'name = "{name}"',
+        "",
+        "[chain]",
+        f'url = "{chain_url}"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def init_home(
+    home: OperatorHome, passphrase: bytes, *, listen: str, public: str | None, chain_url: str, server: str,
+    now: datetime,
+) -> None:
+    """Make an operator's home: CA, server's identity, seed of the accounts, the owner's reader key.
+
+    server.toml comes last, so that a home that was cut short is no home and can be made again elsewhere.
+    """
+    if home.path.exists() and any(home.path.iterdir()):
+        raise ConfigError(f"{home.path} is not empty; choose another folder, or remove it")
+    check_name(server)
+    home.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    ca = create_ca("rosbridge-eth CA", at=now)
+    home.ca.mkdir(mode=0o700)
+    write_atomically(home.ca / "ca.key.pem", ca.key.to_pem(passphrase), mode=0o600)
+    write_atomically(home.ca / "ca.crt.pem", ca.certificate.to_pem())
+    home.bundles.mkdir(mode=0o700)
+    registry = Registry(home.registry)
+    _enrol(home, registry, ca, Role.SERVER, server, home.server, passphrase, now)
+    _enrol(home, registry, ca, Role.READER, OWNER, home.reader(OWNER), passphrase, now)
+    registry.close()
+    Keyring.create().save(home.accounts, passphrase)
+    write_atomically(home.config, server_toml(listen, public, chain_url, server).encode())
+
+
+def _enrol(
+    home: OperatorHome, registry: Registry, ca: CertificateAuthority, role: Role, name: str, folder: Path,
+    passphrase: bytes, now: datetime,
+) -> Identity:
+    identity = enrol(ca, role, name, at=now)
+    save_identity(folder, identity, [ca.certificate], passphrase)
+    _register(registry, identity.public, None, now, replace=False)
+    return identity
+
+
+def _register(
+    registry: Registry, peer: PeerIdentity, account: str | None, now: datetime, *, replace: bool,
+    number: int | None = None,
+) -> Enrolment:
+    return registry.enrol(
+        number=registry.next_number() if number is None else number,
+        role=peer.role,
+        name=peer.name,
+        fingerprint=peer.signing_certificate.fingerprint(),
+        certificates=peer.signing_certificate.to_pem() + peer.encryption_certificate.to_pem(),
+        account=account,
+        now=now,
+        replace=replace,
+    )
+
+
+def load_ca(home: OperatorHome, passphrase: bytes) -> CertificateAuthority:
+    """The CA with its key. IdentityError for a wrong passphrase."""
+    key_file = home.ca / "ca.key.pem"
+    try:
+        key = sm2.PrivateKey.from_pem(key_file.read_bytes(), password=passphrase)
+    except OSError as error:
+        raise IdentityError(f"{key_file} cannot be read: {error.strerror}") from error
+    except InvalidKey as error:
+        raise IdentityError(f"{key_file} does not open under this passphrase") from error
+    return CertificateAuthority(key, ca_certificate(home))
+
+
+def ca_certificate(home: OperatorHome) -> x509.Certificate:
+    path = home.ca / "ca.crt.pem"
+    try:
+        return read_certificates(path.read_bytes())[0]
+    except OSError as error:
+        raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def server_trust(home: OperatorHome, registry: Registry) -> Trust:
+    """Whom the server believes: certificates of the CA that are in force in the registry."""
+    return Trust(
+        roots=[ca_certificate(home)],
+        allowed=lambda peer: registry.allows(peer.role, peer.name, peer.signing_certificate.fingerprint()),
+    )
+
+
+def deploy_contract(home: OperatorHome, chain: Chain, operator: Keyring) -> Deployment:
+    """Create the contract and write down where it is; ConfigError where one is written down already."""
+    if home.deployment_file.exists():
+        raise ConfigError(
+            f"a contract is deployed already ({home.deployment().contract}); a second one would split the records."
+            f" Make another home, or move {home.deployment_file} away if that chain is gone"
+        )
+    contract = deploy(chain, operator.operator)
+    deployment = _deployment(contract)
+    home.save_deployment(deployment)
+    return deployment
+
+
+def _deployment(contract: Contract) -> Deployment:
+    binding = Binding.of(contract)
+    return Deployment(
+        binding.chain_id, "0x" + binding.genesis.hex(), contract.address, "0x" + binding.code_hash.hex(),
+        contract.chain.head().number,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A robot that was registered: its account, the block, and the bundle's file (None for a --csr robot's key)."""
+
+    name: str
+    account: str
+    block: int
+    bundle: Path
+
+
+def register_robot(
+    home: OperatorHome,
+    name: str,
+    *,
+    ca: CertificateAuthority,
+    keys: Keyring,
+    chain: Chain,
+    password: bytes,
+    now: datetime,
+    replace: bool = False,
+    requests: tuple[x509.CertificateSigningRequest, x509.CertificateSigningRequest] | None = None,
+) -> Registered:
+    """Bind a name to certificates and an account, on the chain and in the registry, and write the bundle.
+
+    requests: the robot's own certificate requests (signing, encryption); its
+    keys never come here then. The chain comes before the registry: a crash in
+    between leaves a registration that `replace` replaces.
+    """
+    config, deployment = load_server_config(home.config), home.deployment()
+    contract = Contract.at(chain, deployment.contract)
+    registry = Registry(home.registry)
+    try:
+        check_name(name)
+        if not replace:
+            registry.require_free(Role.ROBOT, name)
+        number = registry.next_number()
+        account = keys.robot(number).address
+        if requests is None:
+            identity = enrol(ca, Role.ROBOT, name, at=now)
+            peer, files = identity.public, identity_files(identity, [ca.certificate], password)
+        else:
+            peer = enrol_requests(ca, Role.ROBOT, name, *requests, at=now)
+            files = {
+                "sign.crt.pem": peer.signing_certificate.to_pem(),
+                "enc.crt.pem": peer.encryption_certificate.to_pem(),
+                "ca.crt.pem": ca.certificate.to_pem(),
+            }
+        certificates = join_certificates(peer.signing_certificate.to_der(), peer.encryption_certificate.to_der())
+        known = contract.robot(robot_id(name)).registered
+        if known and not replace:
+            raise IdentityError(
+                f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
+            )
+        call = "replaceRegistration" if known else "registration"
+        receipt = contract.transact(keys.operator, call, robot_id(name), account, certificates)
+        allot(contract, keys, account, config)
+        _register(registry, peer, account, now, replace=replace, number=number)
+        bundle = Bundle(
+            name=name,
+            identity={file: content.decode() for file, content in files.items()},
+            server_name=config.name,
+            server_address=str(config.public or config.listen),
+            readers=tuple(reader.certificates.decode() for reader in readers(registry)),
+            contract=deployment.contract,
+            chain_id=deployment.chain_id,
+        )
+    finally:
+        registry.close()
+    path = home.bundles / f"{name}.bundle"
+    write_atomically(path, seal_bundle(bundle, password), mode=0o600)
+    return Registered(name, account, receipt.block_number, path)
+
+
+def allot(contract: Contract, keys: Keyring, account: str, config: ServerConfig) -> None:
+    """Give a robot's account its first ETH, so that its first write need not wait; later the submitter does."""
+    if contract.chain.balance(account) < int(config.funds.below * _WEI):
+        contract.transact(keys.operator, "allocETH", account, value=int(config.funds.by * _WEI))
+
+
+def readers(registry: Registry) -> Sequence[Enrolment]:
+    """The readers in force."""
+    return [reader for reader in registry.all(Role.READER) if reader.revoked_at is None]
+
+
+def enrol_reader(
+    home: OperatorHome, name: str, *, ca: CertificateAuthority, password: bytes, now: datetime
+) -> Path:
+    """Make another reader's identity; robots that are registered from now on seal for it too."""
+    registry = Registry(home.registry)
+    try:
+        registry.require_free(Role.READER, check_name(name))
+        _enrol(home, registry, ca, Role.READER, name, home.reader(name), password, now)
+    finally:
+        registry.close()
+    return home.reader(name)
+
+
+def revoke(home: OperatorHome, role: Role, name: str, *, keys: Keyring, chain: Chain, now: datetime) -> int | None:
+    """Take a name out of force: the server closes its session, the contract its right to write (the block of that).
+
+    The registry comes first: from then on the server refuses the name, whatever the chain does.
+    """
+    registry = Registry(home.registry)
+    try:
+        in_force = registry.find(role, name)
+        if in_force is None and role is not Role.ROBOT:
+            raise IdentityError(f"no {role} {name!r} is enrolled; `status` lists the names")
+        if in_force is not None:
+            registry.revoke(role, name, now)
+    finally:
+        registry.close()
+    if role is not Role.ROBOT:
+        return None
+    contract = Contract.at(chain, home.deployment().contract)
+    if not contract.robot(robot_id(name)).may_write:
+        if in_force is None:
+            raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
+        return None
+    return contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number
+
+
+def load_server_identity(home: OperatorHome, passphrase: bytes) -> Identity:
+    identity, _ = load_identity(home.server, passphrase)
+    return identity

@@ -1,0 +1,117 @@
+"""From the inbox to the chain: lease, batch, journal, submit, acknowledge. One such process acts for a store.
+
+A record leaves the inbox when the journal has it on disk, and not before: a
+crash between the two is a lease that runs out, and the journal recognises
+what it has already.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+
+from rosbridge_eth.ledger.batching import Batcher, Limits, refusal
+from rosbridge_eth.ledger.chain import Chain
+from rosbridge_eth.ledger.pump import pump
+from rosbridge_eth.ledger.submitter import BatchTiming, Submitter
+from rosbridge_eth.records import SealedRecord
+from rosbridge_eth.store import Inbox
+
+log = logging.getLogger(__name__)
+
+LEASE = 60.0  # seconds; many times a batch's age
+LEASE_RECORDS = 512
+LEASE_BYTES = 1 << 20
+MAX_BACKLOG = 64  # batches on their way, above which the inbox keeps the rest
+DONE_KEPT = 30 * 86_400.0  # seconds for which finished identities are recognised as duplicates
+FORGET_EVERY = 3600.0
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
+
+
+class Submission:
+    """Moves records from an inbox to a chain. `now` is the wall clock in seconds, shared with the inbox."""
+
+    def __init__(
+        self,
+        inbox: Inbox,
+        submitter: Submitter,
+        chain: Chain,
+        *,
+        limits: Limits,
+        holder: str,
+        keep_batches: float,
+        prune: Callable[[float], int],
+    ) -> None:
+        self._inbox, self._submitter, self._chain = inbox, submitter, chain
+        self._limits, self._batcher, self._holder = limits, Batcher(limits), holder
+        self._keep_batches, self._prune = keep_batches, prune
+        self._forget_at = 0.0
+        self.timings: list[BatchTiming] = []
+        self._said: str | None = None
+
+    def turn(self, now: float, *, flush: bool = False) -> bool:
+        """Do what can be done at `now`; whether anything moved. `flush` closes batches before they are full or old."""
+        moved = self._gather(now)
+        for batch in self._batcher.due(now, flush=flush):
+            self._seal(batch, now)
+            moved = True
+        pump(self._submitter, self._chain, now)
+        moved = self._tell(now) or moved
+        if now >= self._forget_at:
+            self._forget_at = now + FORGET_EVERY
+            self._inbox.forget(now - DONE_KEPT)
+            self._prune(now - self._keep_batches)
+        return moved
+
+    def _gather(self, now: float) -> bool:
+        """Take waiting records over into open batches, while the chain keeps up."""
+        if self._submitter.backlog() >= MAX_BACKLOG or len(self._batcher) >= LEASE_RECORDS:
+            return False
+        leased = self._inbox.lease(
+            self._holder, limit=LEASE_RECORDS, max_bytes=LEASE_BYTES, now=now, ttl=LEASE
+        )
+        for entry in leased:
+            if refusal(entry.record, self._limits) is None:
+                self._batcher.add(entry.record, now)
+            else:
+                self._seal([entry.record], now)  # the journal keeps it as a dead letter, with the reason
+        return bool(leased)
+
+    def _seal(self, batch: list[SealedRecord], now: float) -> None:
+        sealing = self._submitter.seal(batch, now)
+        self._inbox.done([record.id for record in batch], now)
+        for job in sealing.jobs:
+            log.info("batch %s of robot %s: %d records", job.batch_index, job.robot.hex()[:8], job.count)
+        for id in sealing.dead:
+            log.error("record %s can be in no batch; see the dead letters", id)
+
+    def _tell(self, now: float) -> bool:
+        confirmed = self._submitter.confirmed()
+        if confirmed:
+            self._submitter.acknowledge(confirmed)
+        for timing in self._submitter.timings():
+            self.timings.append(timing)
+            log.info("batch of %d records confirmed in block %d, 0x%s", timing.records, timing.block_number,
+                     timing.tx_hash.hex())
+        status = self._submitter.status()
+        trouble = status.failure or ("the treasury is empty: send ETH to the operator's account"
+                                     if status.treasury_empty else None)
+        if trouble != self._said:
+            if trouble is not None:
+                log.warning("%s", trouble)
+            self._said = trouble
+        return bool(confirmed)
+
+    @property
+    def idle(self) -> bool:
+        """Nothing is gathered and nothing is on its way."""
+        return len(self._batcher) == 0 and self._submitter.idle()
+
+    def run(self, stopped: Callable[[], bool], *, clock: Callable[[], float] = time.time) -> None:
+        """Until `stopped()`. What is gathered and not sealed stays in the inbox."""
+        pause = SHORTEST_PAUSE
+        while not stopped():
+            pause = SHORTEST_PAUSE if self.turn(clock()) else min(2 * pause, LONGEST_PAUSE)
+            time.sleep(pause)
+        self._submitter.close()
