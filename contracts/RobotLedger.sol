@@ -158,17 +158,23 @@ contract RobotLedger {
     /// Record one ciphertext Cp: a batch of one.
     function setData(bytes32 Tk, uint256 batchIndex, bytes16 stream, uint64 seq, bytes calldata Cp)
         external
-        returns (bytes32)
+        returns (bytes32 newRoot)
     {
         if (Cp.length == 0 || Cp.length > type(uint16).max) revert MalformedRecords(0);
-        bytes memory run = abi.encodePacked(stream, seq, uint16(1), uint16(Cp.length), Cp);
-        return _record(Tk, batchIndex, _leaf(Tk, stream, seq, keccak256(Cp)), run);
+        newRoot = _leaf(Tk, stream, seq, keccak256(Cp));
+        (bool fresh, uint64 number, uint64 previousBlock) = _claim(Tk, batchIndex, newRoot);
+        if (fresh) {
+            bytes memory records = abi.encodePacked(stream, seq, uint16(1), uint16(Cp.length), Cp);
+            emit Batch(Tk, batchIndex, msg.sender, newRoot, number, previousBlock, records);
+        }
     }
 
     /// Record many: one event, and their Merkle root in storage. Writing the same batch again
     /// returns quietly, another one under the same index reverts: a write may be repeated.
-    function setBatch(bytes32 Tk, uint256 batchIndex, bytes calldata records) external returns (bytes32) {
-        return _record(Tk, batchIndex, merkleRoot(Tk, records), records);
+    function setBatch(bytes32 Tk, uint256 batchIndex, bytes calldata records) external returns (bytes32 newRoot) {
+        newRoot = merkleRoot(Tk, records);
+        (bool fresh, uint64 number, uint64 previousBlock) = _claim(Tk, batchIndex, newRoot);
+        if (fresh) emit Batch(Tk, batchIndex, msg.sender, newRoot, number, previousBlock, records);
     }
 
     // ------------------------------------------------------------------ anyone
@@ -207,35 +213,38 @@ contract RobotLedger {
 
     /// Merkle root of packed records. One pass: stack[k] is the root of a full tree of 2**k
     /// leaves where bit k of the number of leaves is set; the smaller trees join from the right.
+    /// Unchecked arithmetic: positions are below 2**32 (calldata is paid for), seq below 2**65.
     function merkleRoot(bytes32 Tk, bytes calldata records) public pure returns (bytes32 node) {
-        bytes32[32] memory stack;
-        uint256 leaves = 0;
-        uint256 position = 0;
-        uint256 end = records.length;
-        while (position < end) {
-            if (position + 26 > end) revert MalformedRecords(position);
-            bytes16 stream = bytes16(records[position:position + 16]);
-            uint256 seq = uint64(bytes8(records[position + 16:position + 24]));
-            uint256 after_ = seq + uint16(bytes2(records[position + 24:position + 26]));
-            if (after_ == seq || after_ > 1 << 64) revert MalformedRecords(position);
-            position += 26;
-            for (; seq < after_; ++seq) {
-                if (position + 2 > end) revert MalformedRecords(position);
-                uint256 length = uint16(bytes2(records[position:position + 2]));
-                if (length == 0 || position + 2 + length > end) revert MalformedRecords(position);
-                node = _leaf(Tk, stream, uint64(seq), keccak256(records[position + 2:position + 2 + length]));
-                position += 2 + length;
-                uint256 level = 0;
-                for (uint256 n = leaves++; n % 2 == 1; n /= 2) node = _node(stack[level++], node);
-                stack[level] = node;
+        unchecked {
+            bytes32[32] memory stack;
+            uint256 leaves = 0;
+            uint256 position = 0;
+            uint256 end = records.length;
+            while (position < end) {
+                if (position + 26 > end) revert MalformedRecords(position);
+                bytes16 stream = bytes16(records[position:position + 16]);
+                uint256 seq = uint64(bytes8(records[position + 16:position + 24]));
+                uint256 after_ = seq + uint16(bytes2(records[position + 24:position + 26]));
+                if (after_ == seq || after_ > 1 << 64) revert MalformedRecords(position);
+                position += 26;
+                for (; seq < after_; ++seq) {
+                    if (position + 2 > end) revert MalformedRecords(position);
+                    uint256 length = uint16(bytes2(records[position:position + 2]));
+                    if (length == 0 || position + 2 + length > end) revert MalformedRecords(position);
+                    node = _leaf(Tk, stream, uint64(seq), keccak256(records[position + 2:position + 2 + length]));
+                    position += 2 + length;
+                    uint256 level = 0;
+                    for (uint256 n = leaves++; n % 2 == 1; n /= 2) node = _node(stack[level++], node);
+                    stack[level] = node;
+                }
             }
-        }
-        if (leaves == 0) revert MalformedRecords(0);
-        uint256 k = 0;
-        while (leaves >> k & 1 == 0) ++k;
-        node = stack[k];
-        for (++k; leaves >> k > 0; ++k) {
-            if (leaves >> k & 1 == 1) node = _node(stack[k], node);
+            if (leaves == 0) revert MalformedRecords(0);
+            uint256 k = 0;
+            while (leaves >> k & 1 == 0) ++k;
+            node = stack[k];
+            for (++k; leaves >> k > 0; ++k) {
+                if (leaves >> k & 1 == 1) node = _node(stack[k], node);
+            }
         }
     }
 
@@ -266,28 +275,48 @@ contract RobotLedger {
         robot.changedAt = uint64(block.number);
     }
 
-    function _record(bytes32 Tk, uint256 batchIndex, bytes32 newRoot, bytes memory records) private returns (bytes32) {
+    /// Take the index for this root, once: False if it was taken for this very root before.
+    function _claim(bytes32 Tk, uint256 batchIndex, bytes32 newRoot)
+        private
+        returns (bool fresh, uint40 number, uint40 previousBlock)
+    {
         Robot storage robot = robots[Tk];
         if (robot.account == address(0)) revert NotRegistered(Tk);
         if (robot.account != msg.sender) revert NotTheRobot(Tk, msg.sender);
         if (robot.revoked) revert AlreadyRevoked(Tk, robot.revokedAt);
         if (msg.sender.balance == 0) revert NoBalance(msg.sender);
         bytes32 kept = root[Tk][batchIndex];
-        if (kept == newRoot) return newRoot;
-        if (kept != 0) revert BatchIndexTaken(Tk, batchIndex, kept);
+        if (kept != 0) {
+            if (kept != newRoot) revert BatchIndexTaken(Tk, batchIndex, kept);
+            return (false, 0, 0);
+        }
         root[Tk][batchIndex] = newRoot;
-        uint40 number = robot.batches + 1;
-        emit Batch(Tk, batchIndex, msg.sender, newRoot, number, robot.batchBlock, records);
-        robot.batches = number;
-        robot.batchBlock = uint40(block.number);
-        return newRoot;
+        (number, previousBlock) = (robot.batches + 1, robot.batchBlock);
+        (robot.batches, robot.batchBlock) = (number, uint40(block.number));
+        return (true, number, previousBlock);
     }
 
-    function _leaf(bytes32 Tk, bytes16 stream, uint64 seq, bytes32 ciphertextHash) private pure returns (bytes32) {
-        return keccak256(abi.encodePacked(bytes1(0x00), Tk, stream, seq, ciphertextHash));
+    // Both hash beyond the end of used memory, which the next write overwrites: nothing is allocated.
+
+    function _leaf(bytes32 Tk, bytes16 stream, uint64 seq, bytes32 ciphertextHash) private pure returns (bytes32 hash) {
+        assembly ("memory-safe") {
+            let free := mload(0x40)
+            mstore8(free, 0)
+            mstore(add(free, 1), Tk)
+            mstore(add(free, 33), stream) // left-aligned; seq overwrites the zeros behind it
+            mstore(add(free, 49), shl(192, seq))
+            mstore(add(free, 57), ciphertextHash)
+            hash := keccak256(free, 89)
+        }
     }
 
-    function _node(bytes32 left, bytes32 right) private pure returns (bytes32) {
-        return keccak256(abi.encodePacked(bytes1(0x01), left, right));
+    function _node(bytes32 left, bytes32 right) private pure returns (bytes32 hash) {
+        assembly ("memory-safe") {
+            let free := mload(0x40)
+            mstore8(free, 1)
+            mstore(add(free, 1), left)
+            mstore(add(free, 33), right)
+            hash := keccak256(free, 65)
+        }
     }
 }
