@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Protocol
 
 from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.wire import Mode, Reason
@@ -22,6 +23,7 @@ __all__ = [
     "Disconnected",
     "Drop",
     "End",
+    "Endpoint",
     "Event",
     "Full",
     "HandshakeFailed",
@@ -76,7 +78,6 @@ class Drop(StrEnum):
     EARLY = "before the handshake was finished"
     RESET = "reset that proves nothing"
     FULL = "messages refused for lack of room"
-    SEND = "the socket did not take it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +141,20 @@ class HandshakeFailed:
 
 
 Event = Connected | Disconnected | MessageReceived | MessageAnswered | AddressChanged | HandshakeFailed
+
+
+class Endpoint(Protocol):
+    """What Client and Server have in common."""
+
+    def receive_datagram(self, data: bytes, address: Address, now: float) -> None: ...
+
+    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]: ...
+
+    def next_timer(self) -> float | None: ...
+
+    def handle_timer(self, now: float) -> None: ...
+
+    def next_event(self) -> Event | None: ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -177,7 +177,7 @@ class InFlight(Generic[T]):
         for packet in self._packets.values():
             if packet.number > self.largest_acked:
                 break
-            if packet.at <= now - delay or packet.number <= self.largest_acked - PACKET_THRESHOLD:
+            if packet.at + delay <= now or packet.number <= self.largest_acked - PACKET_THRESHOLD:
                 lost.append(packet)
         for packet in lost:
             del self._packets[packet.number]

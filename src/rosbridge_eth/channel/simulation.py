@@ -11,26 +11,11 @@ import heapq
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import Event
+from rosbridge_eth.channel.events import Endpoint, Event
 
-__all__ = ["Endpoint", "Faults", "Host", "Network"]
-
-
-class Endpoint(Protocol):
-    """What Client and Server have in common."""
-
-    def receive_datagram(self, data: bytes, address: Address, now: float) -> None: ...
-
-    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]: ...
-
-    def next_timer(self) -> float | None: ...
-
-    def handle_timer(self, now: float) -> None: ...
-
-    def next_event(self) -> Event | None: ...
+__all__ = ["Faults", "Host", "Network"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +78,7 @@ class Network:
             return
         copies = 2 if draw.random() < faults.duplication else 1
         for _ in range(copies):
-            if draw.random() < faults.corruption:
+            if data and draw.random() < faults.corruption:
                 data = self._corrupted(data)
             self.inject(data, source, target, faults.delay + draw.random() * faults.jitter)
 

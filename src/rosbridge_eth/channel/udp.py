@@ -1,0 +1,268 @@
+"""Sockets under the channel: a loop that receives, hands out events, and sends. The only part that waits.
+
+Several processes of a server share one port by SO_REUSEPORT. Where the kernel
+takes a filter for it (Linux, SO_ATTACH_REUSEPORT_CBPF), a datagram goes to
+the process whose number stands in its connection id, so a robot whose address
+changes stays with its process; elsewhere the kernel chooses by address, and
+such a robot makes a new session after `silence_timeout`.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import select
+import socket
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from rosbridge_eth.channel.admission import Address
+from rosbridge_eth.channel.events import Endpoint, Event
+from rosbridge_eth.errors import NetworkError
+
+__all__ = ["UdpLoop", "client_socket", "server_sockets"]
+
+RECEIVE_BUFFER = 4 << 20  # bytes: about 3,500 full datagrams while the process is busy elsewhere
+SEND_BUFFER = 1 << 20
+LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
+BATCH = 128  # datagrams taken before events are handed out and answers sent
+LONGEST_WAIT = 1.0  # s
+
+_SO_REUSEPORT = getattr(socket, "SO_REUSEPORT", None)
+_SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
+
+_TRANSIENT = frozenset(
+    {
+        errno.EAGAIN,
+        errno.ENOBUFS,
+        errno.ENETDOWN,
+        errno.ENETUNREACH,
+        errno.EHOSTDOWN,
+        errno.EHOSTUNREACH,
+        errno.ECONNREFUSED,
+        errno.ECONNRESET,
+        errno.EADDRNOTAVAIL,
+        errno.EPERM,
+        errno.EACCES,
+        errno.EMSGSIZE,
+    }
+)
+"""What a network may do to a datagram: it is lost, and the channel sends it again."""
+
+
+def _open(family: int) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    # The kernel grants what its limits allow (net.core.rmem_max); less only means more retransmissions.
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+    return sock
+
+
+def _resolve(address: Address, *, passive: bool) -> tuple[int, Address]:
+    host, port = address
+    flags = socket.AI_PASSIVE if passive else 0
+    try:
+        found = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags)
+    except socket.gaierror as error:
+        raise NetworkError(f"the address {host!r} cannot be found: {error.strerror}") from error
+    family, _, _, _, place = found[0]
+    return family, (str(place[0]), int(place[1]))
+
+
+def client_socket(server: Address) -> tuple[socket.socket, Address]:
+    """A socket to talk to `server` (host name or address, port), and its address for Client.connect."""
+    family, address = _resolve(server, passive=False)
+    return _open(family), address
+
+
+def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
+    """Sockets bound to one address, one for each worker, in the order of their numbers.
+
+    Open them in the parent process and let each worker inherit its own; while
+    the parent keeps them open, a worker that is started again finds its
+    datagrams waiting. NetworkError if the port is taken or not allowed.
+    """
+    family, place = _resolve(address, passive=True)
+    if workers > 1 and _SO_REUSEPORT is None:
+        raise NetworkError("this system cannot share a port between processes; run with one worker")
+    sockets: list[socket.socket] = []
+    try:
+        # Bound without SO_REUSEPORT first: another server's port must be an error, not half of its datagrams.
+        with _open(family) as probe:
+            probe.bind(place)
+            if place[1] == 0:
+                place = (place[0], probe.getsockname()[1])
+        for _ in range(workers):
+            sock = _open(family)
+            sockets.append(sock)
+            if workers > 1 and _SO_REUSEPORT is not None:
+                sock.setsockopt(socket.SOL_SOCKET, _SO_REUSEPORT, 1)
+            sock.bind(place)
+    except OSError as error:
+        for sock in sockets:
+            sock.close()
+        raise NetworkError(
+            f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; "
+            "stop the program that has it, or choose another port"
+        ) from error
+    if workers > 1:
+        _steer(sockets[0], workers)
+    return sockets
+
+
+def _steer(sock: socket.socket, workers: int) -> bool:
+    """Send each datagram to the socket whose index is the first byte of its connection id, modulo `workers`.
+
+    Returns whether the kernel took the filter. Its program, over the UDP payload:
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    program = [
+        (0x30, 0, 0, 0),  # A = byte 0: the kind
+        (0x35, 0, 2, 0x40),  # kind >= DATA ? go on : skip 2
+        (0x30, 0, 0, 1),  # A = byte 1: first of the server's connection id, its worker's number
+        (0x05, 0, 0, 1),  # skip 1
+        (0x30, 0, 0, 3),  # A = byte 3: first of the client's connection id, in HELLO and PROOF
+        (0x94, 0, 0, workers),  # A %= workers
+        (0x16, 0, 0, 0),  # return A
+    ]
+    code = array.array("B", b"".join(struct.pack("=HBBI", *step) for step in program))
+    argument = struct.pack("@HP", len(program), code.buffer_info()[0])
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, argument)
+    except OSError:
+        return False  # an old kernel or a sandbox; the kernel then chooses by address
+    return True
+
+
+class UdpLoop:
+    """Drives one endpoint over one socket, in one thread.
+
+    on_event is called with each event. on_batch, if given, is called with
+    `now` when all events at hand were given out: the place to commit a group
+    and reply. `submit` may be called from any thread; all else from the
+    loop's own.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        sock: socket.socket,
+        on_event: Callable[[Event], None],
+        *,
+        on_batch: Callable[[float], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.endpoint = endpoint
+        self.socket = sock
+        self.lost_sends = 0
+        """Datagrams that the system did not take."""
+        self._on_event = on_event
+        self._on_batch = on_batch
+        self._clock = clock
+        self._calls: deque[Callable[[float], None]] = deque()
+        self._wake_receive, self._wake_send = socket.socketpair()
+        self._wake_receive.setblocking(False)
+        self._wake_send.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(sock, select.POLLIN)
+        self._poll.register(self._wake_receive, select.POLLIN)
+        self._stop = threading.Event()
+
+    def submit(self, call: Callable[[float], None]) -> None:
+        """Have `call(now)` called in the loop's thread, soon."""
+        self._calls.append(call)
+        self.wake()
+
+    def wake(self) -> None:
+        """Make a waiting `step` return, from any thread or a signal handler."""
+        try:
+            self._wake_send.send(b"\0")
+        except BlockingIOError:
+            return  # wake-ups enough are waiting already
+
+    def stop(self) -> None:
+        """Let `run` return after its present step, from any thread."""
+        self._stop.set()
+        self.wake()
+
+    def run(self) -> None:
+        """Go on until `stop`."""
+        while not self._stop.is_set():
+            self.step(LONGEST_WAIT)
+        self._flush(self._clock())
+
+    def step(self, longest: float) -> None:
+        """Send what may be sent; wait for something, at most `longest` seconds; take it and give out its events."""
+        endpoint, clock = self.endpoint, self._clock
+        now = clock()
+        self._give_out(now)
+        self._flush(now)
+        when = endpoint.next_timer()
+        wait = longest if when is None else min(longest, max(0.0, when - now))
+        if self._calls:
+            wait = 0.0
+        # Rounded up to a millisecond: to wake too early would be to wait in circles.
+        ready = self._poll.poll(int(wait * 1000 + 0.999))
+        now = clock()
+        for descriptor, _ in ready:
+            if descriptor == self.socket.fileno():
+                self._receive(now)
+            else:
+                self._drain_wakeups()
+        while self._calls:
+            self._calls.popleft()(now)
+        when = endpoint.next_timer()
+        if when is not None and when <= now:
+            endpoint.handle_timer(now)
+        self._give_out(now)
+        self._flush(clock())
+
+    def close(self) -> None:
+        """Close the socket and what belongs to the loop."""
+        self.socket.close()
+        self._wake_receive.close()
+        self._wake_send.close()
+
+    def _drain_wakeups(self) -> None:
+        try:
+            while self._wake_receive.recv(4096):
+                pass
+        except BlockingIOError:
+            return
+
+    def _receive(self, now: float) -> None:
+        receive, take = self.socket.recvfrom, self.endpoint.receive_datagram
+        for _ in range(BATCH):
+            try:
+                data, place = receive(LONGEST)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if error.errno in _TRANSIENT:
+                    continue  # news of a datagram sent before, such as ECONNREFUSED
+                raise NetworkError(f"the socket cannot be read: {error.strerror}") from error
+            take(data, (place[0], place[1]), now)
+
+    def _give_out(self, now: float) -> None:
+        any_event = False
+        while (event := self.endpoint.next_event()) is not None:
+            any_event = True
+            self._on_event(event)
+        if any_event and self._on_batch is not None:
+            self._on_batch(now)
+
+    def _flush(self, now: float) -> None:
+        send = self.socket.sendto
+        for data, address in self.endpoint.datagrams_to_send(now):
+            try:
+                send(data, address)
+            except OSError as error:
+                if error.errno not in _TRANSIENT:
+                    raise NetworkError(f"the socket cannot be written: {error.strerror}") from error
+                self.lost_sends += 1
