@@ -1,0 +1,47 @@
+"""The back ends of the inbox that the conformance suite runs on.
+
+A back end makes independent Inbox objects on one set of data, as several
+processes of a server would. To add one: a class with this interface, and its
+name in BACKENDS.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from rosbridge_eth.store import Inbox, InboxLimits, SqliteInbox
+
+
+class Backend(Protocol):
+    def __init__(self, folder: Path) -> None: ...
+
+    def open(self, limits: InboxLimits = InboxLimits()) -> Inbox:
+        """Another Inbox on the same data."""
+        ...
+
+    def opener_source(self) -> str:
+        """Python source of an expression that opens it in another process."""
+        ...
+
+    def clear(self) -> None:
+        """Remove all data; nothing has it open."""
+        ...
+
+
+class SqliteBackend:
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "inbox.db"
+
+    def open(self, limits: InboxLimits = InboxLimits()) -> Inbox:
+        return SqliteInbox(self._path, limits)
+
+    def opener_source(self) -> str:
+        return f"__import__('rosbridge_eth.store').store.SqliteInbox({str(self._path)!r})"
+
+    def clear(self) -> None:
+        for path in self._path.parent.glob(self._path.name + "*"):
+            path.unlink()
+
+
+BACKENDS: dict[str, type[Backend]] = {"sqlite": SqliteBackend}
