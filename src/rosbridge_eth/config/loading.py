@@ -18,6 +18,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from rosbridge_eth.config.models import SOURCE_KINDS, ReaderConfig, RobotConfig, Section, ServerConfig
+from rosbridge_eth.config.values import SIZE, duration_text, size_text
 from rosbridge_eth.errors import ConfigError, IdentityError
 
 _Config = TypeVar("_Config", bound=Section)
@@ -49,7 +50,7 @@ def parse_config(model: type[_Config], text: str, file: Path) -> _Config:
     try:
         return model.model_validate(values, context={"folder": file.parent})
     except ValidationError as error:
-        problems = [_problem(model, detail, text) for detail in error.errors(include_url=False)]
+        problems = [_problem(model, detail, text, values) for detail in error.errors(include_url=False)]
         shown = "; ".join(problems[:MAX_PROBLEMS])
         more = f"; and {len(problems) - MAX_PROBLEMS} more" if len(problems) > MAX_PROBLEMS else ""
         raise ConfigError(f"{file}: {shown}{more}") from None
@@ -116,7 +117,7 @@ _BOUNDS = {
 }
 
 
-def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
+def _problem(model: type[Section], detail: ErrorDetails, text: str, values: Mapping[str, Any]) -> str:
     location = _without_tags(detail["loc"])
     key = _key(location)
     kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
@@ -139,7 +140,8 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
         sentence = f"{key} is {_shown(given)}; it should be {_EXPECTED[kind]}"
     elif kind in _BOUNDS:
         name, words = _BOUNDS[kind]
-        sentence = f"{key} is {_shown(given)}; it should be {words} {context[name]}"
+        given, bound = _as_written(values, location, given, context[name])
+        sentence = f"{key} is {_shown(given)}; it should be {words} {bound}"
     elif kind == "too_short":
         sentence = f"{key} is empty"
     elif kind == "value_error":
@@ -150,6 +152,21 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
         sentence = f"{key} is {_shown(given)}; {_decapitalised(detail['msg'])}"
     line = _line(text, location)
     return f"line {line}: {sentence}" if line and location else sentence
+
+
+def _as_written(values: Mapping[str, Any], location: Sequence[str | int], given: Any, bound: Any) -> tuple[Any, str]:
+    """A value and its bound as the file has them: a bound on a duration or a size gets its unit."""
+    written: Any = values
+    for part in location:
+        try:
+            written = written[part]
+        except (KeyError, IndexError, TypeError):
+            return given, str(bound)
+    if not isinstance(written, str):
+        return given, str(bound)
+    if SIZE.fullmatch(written):
+        return written, repr(size_text(bound))
+    return written, repr(duration_text(bound if isinstance(given, float) else bound / 1e9))
 
 
 def _without_tags(location: Sequence[str | int]) -> tuple[str | int, ...]:

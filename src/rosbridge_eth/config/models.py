@@ -160,9 +160,7 @@ class SimConfig(Section):
     """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`; the default, so that anything can be tried."""
 
     kind: Literal["sim"] = Field(default="sim", description="`sim`")
-    robot: Annotated[str, AfterValidator(_topic_part)] = Field(
-        default="robot_1", description="The NAME in its topics."
-    )
+    robot: Annotated[str, AfterValidator(_topic_part)] = Field(default="robot_1", description="The NAME in its topics.")
     seed: int = Field(default=1, ge=0, lt=2**63, description="The same seed drives the same way.")
     rate: float = Field(default=10.0, gt=0, le=10_000, description="Odometry and IMU messages per second.")
     duration: DurationNs | None = Field(default=None, description="End after so long; without it, never.")
@@ -193,17 +191,13 @@ SourceConfig: TypeAlias = Annotated[BagConfig | SimConfig, Discriminator("kind")
 
 
 class SpoolConfig(Section):
-    """Records that the server has not acknowledged; sealed before they get there."""
+    """Records that the server has not acknowledged; sealed before they get there. When there is no room, `latest`
+    records are dropped first, then the oldest; what was dropped is declared on the chain."""
 
-    max_records: int = Field(default=100_000, ge=16, description="Records kept, at most.")
-    max_size: Size = Field(default=64 * MIB, ge=MIB, description="Bytes kept, at most.")
+    max_records: int = Field(default=1_000_000, ge=16, description="Records kept, at most.")
+    max_size: Size = Field(default=256 * MIB, ge=MIB, description="Bytes kept, at most.")
     commit: Seconds = Field(
-        default=0.02, le=10, description="Group commit: a power failure loses what was captured within so long."
-    )
-    when_full: Literal["drop-oldest", "drop-newest"] = Field(
-        default="drop-oldest",
-        description="Which `reliable` records are given up when there is no room and no `latest` record is left to "
-        "drop. What is dropped is declared on the chain.",
+        default=0.05, le=10, description="Group commit: a power failure loses what was captured within so long."
     )
 
 

@@ -22,7 +22,7 @@ _UNITS_NS = {"ms": 10**6, "s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9, "d": 8
 _PART = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?(ms|s|m|h|d)", re.ASCII)
 _DURATION = re.compile(rf"{_PART.pattern}(?: ?{_PART.pattern})*", re.ASCII)
 _SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
-_SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
+SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
 _HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]{1,253}):(\d{1,5})", re.ASCII)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -62,7 +62,7 @@ def parse_size(value: Any) -> int:
     """Bytes."""
     if isinstance(value, int) and not isinstance(value, bool) and value > 0:
         return value
-    match = _SIZE.fullmatch(value) if isinstance(value, str) else None
+    match = SIZE.fullmatch(value) if isinstance(value, str) else None
     size = round(float(match[1]) * _SIZES[match[2]]) if match else 0
     if size < 1:
         raise ValueError(f'is {value!r}; write a size such as "64 MiB", "500 kB" or a number of bytes')
@@ -94,6 +94,22 @@ def parse_path(value: Any, info: ValidationInfo) -> Path:
     folder = info.context.get("folder") if info.context else None
     path = Path(value).expanduser()
     return folder / path if isinstance(folder, Path) else path
+
+
+def duration_text(seconds: float) -> str:
+    """As a person writes it."""
+    for length, unit in ((86_400, "d"), (3600, "h"), (60, "m"), (1, "s")):
+        if seconds >= length and seconds % length == 0:
+            return f"{round(seconds / length)}{unit}"
+    return f"{round(seconds * 1000)}ms"
+
+
+def size_text(size: int) -> str:
+    """As a person writes it."""
+    for length, unit in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
+        if size >= length and size % length == 0:
+            return f"{size // length} {unit}"
+    return f"{size} B"
 
 
 DurationNs = Annotated[int, BeforeValidator(parse_duration)]

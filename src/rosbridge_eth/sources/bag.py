@@ -9,7 +9,7 @@ Iron, sqlite3) is read with those that its distribution ships.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +90,7 @@ class BagSource:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
         return self._offers
 
-    def decoders(self) -> dict[str, list[Decoder]]:
+    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration before the replay."""
         found: dict[str, list[Decoder]] = {}
         for connection, topic, _ in self._connections:

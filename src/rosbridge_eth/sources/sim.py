@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -103,7 +103,7 @@ class SimSource:
         """Odometry and IMU."""
         return self._offers
 
-    def decoders(self) -> dict[str, list[Decoder]]:
+    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration beforehand."""
         return {topic: [decoder] for topic, decoder in self._watched.items()}
 

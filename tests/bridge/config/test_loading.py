@@ -1,0 +1,239 @@
+"""Every kind of mistake in a configuration, and the sentence that mends it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rosbridge_eth.capture import TopicRule
+from rosbridge_eth.config import (
+    ReaderConfig,
+    RobotConfig,
+    ServerConfig,
+    load_reader_config,
+    load_robot_config,
+    load_server_config,
+    parse_config,
+    require_file,
+    require_private,
+)
+from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.sources import BagSettings, SimSettings
+
+S = 10**9
+FILE = Path("/etc/rosbridge/robot.toml")
+
+
+def robot(text: str) -> RobotConfig:
+    return parse_config(RobotConfig, text, FILE)
+
+
+def server(text: str) -> ServerConfig:
+    return parse_config(ServerConfig, text, Path("server.toml"))
+
+
+def test_one_line_is_a_whole_configuration():
+    config = robot('topics = ["/robot_1/odom"]')
+    assert config.rules() == [TopicRule("/robot_1/odom")]
+    assert config.source.settings() == SimSettings()
+    assert config.channel == "exchange"
+
+
+def test_topics_are_names_or_tables():
+    config = robot(
+        """
+nodes = ["/robot_1/base"]
+topics = [
+    "robot_1/imu",
+    { topic = "/robot_1/odom", fields = ["pose.pose.position"], rate = 2, delivery = "latest", oversize = "refuse" },
+    { topic = "/a", from = 1970-01-01T00:00:01Z, until = "1970-01-01T00:00:02Z" },
+    { topic = "/b", for = "2s", once = true },
+    { topic = "/c/*", at = 1970-01-01T00:00:03Z },
+]
+[capture]
+delivery = "reliable"
+field_limit = "2 KiB"
+"""
+    )
+    rules = {rule.topic: rule for rule in config.rules()}
+    assert list(rules) == ["/robot_1/imu", "/robot_1/odom", "/a", "/b", "/c/*", "**"]
+    assert all(rule.limit == 2048 for rule in rules.values())
+    odom = rules["/robot_1/odom"]
+    assert (odom.fields, odom.rate, odom.delivery, odom.oversize) == (("pose.pose.position",), 2, "latest", "refuse")
+    assert (rules["/a"].from_ns, rules["/a"].until_ns) == (S, 2 * S)
+    assert (rules["/b"].for_ns, rules["/b"].once) == (2 * S, True)
+    assert rules["/c/*"].at_ns == 3 * S
+    assert rules["**"].delivery == "reliable", "what a node publishes, by the defaults"
+
+
+def test_a_bag_stands_relative_to_the_file():
+    bag = 'topics = ["/a"]\n[source]\nkind = "bag"\n'
+    config = robot(bag + 'path = "x/y.bag"\nspeed = "max"\nstart = "1s"\nstop = "3s"')
+    assert config.source.settings() == BagSettings(Path("/etc/rosbridge/x/y.bag"), None, S, 3 * S)
+    config = robot(bag + 'path = "/x/y.bag"\nspeed = 2')
+    assert config.source.settings() == BagSettings(Path("/x/y.bag"), 2.0, 0, None)
+
+
+MISTAKES = {
+    # The line, the key, what was given, what is allowed, and the nearest right word.
+    'topcs = ["/a"]': "line 1: unknown key 'topcs'; did you mean 'topics'?",
+    'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "line 4: unknown key 'max_sise' in spool; did you mean 'max_size'?",
+    'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: acknowledge, capture, channel, name, nodes, ",
+    'topics = [{topic = "/a", rat = 1}]': "line 1: unknown key 'rat' in topics[0]; did you mean 'rate'?",
+    'topics = ["/a"]\nsource.sped = 1': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
+    "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
+    "topics = []": "it names nothing to watch",
+    'topics = "/a"': "line 1: topics is '/a'; it should be a list in [ ]",
+    "topics = [5]": "line 1: topics[0] is 5; it should be a table",
+    'topics = ["/a", "/a"]': "it names topic /a twice",
+    'topics = ["/a b"]': "line 1: topics[0].topic: '/a b' is not a name or pattern",
+    'nodes = ["/["]': "line 1: nodes[0]: '/[' is not a name or pattern",
+    "topics = [{rate = 1}]": "topics[0].topic is missing",
+    'topics = [{topic = "/a", rate = 0}]': "line 1: topics[0].rate is 0; it should be more than 0",
+    'topics = [{topic = "/a", rate = "2"}]': "topics[0].rate is '2'; it should be a number",
+    'topics = [{topic = "/a", rate = inf}]': "topics[0].rate is inf; it should be a finite number",
+    'topics = [{topic = "/a", once = 1}]': "topics[0].once is 1; it should be true or false",
+    'topics = [{topic = "/a", fields = ["x..y"]}]': "topics[0].fields[0]: 'x..y' is not a field path, such as",
+    'topics = [{topic = "/a", fields = ["x[*]", "x[0]"]}]': "one array is selected by [*] and by an index",
+    'topics = [{topic = "/a", delivery = "relible"}]': (
+        "topics[0].delivery is 'relible'; allowed: 'reliable', 'latest'; did you mean 'reliable'?"
+    ),
+    'topics = [{topic = "/a", at = 2026-01-01T00:00:00Z, rate = 1, for = "2s"}]': (
+        "topics[0] has both `at` and for, rate; a moment is one message, choose one"
+    ),
+    'topics = [{topic = "/a", until = 2026-01-01T00:00:00Z, for = "2s"}]': "has both `until` and `for`",
+    'topics = [{topic = "/a", from = 2026-01-02T00:00:00Z, until = 2026-01-01T00:00:00Z}]': (
+        "topics[0] has a period that ends before it begins"
+    ),
+    'topics = [{topic = "/a", from = 2026-01-02T00:00:00}]': "say in which time zone",
+    'topics = [{topic = "/a", for = 5}]': 'topics[0].for is 5; write a duration with its unit, such as "250ms"',
+    'topics = ["/a"]\nsource = 3': "line 2: source is 3; write a table",
+    'topics = ["/a"]\n[source]\nkind = "bog"': "source has kind 'bog'; allowed: 'bag', 'sim'; did you mean 'bag'?",
+    'topics = ["/a"]\n[source]\nkind = 1': "source has kind 1; allowed: 'bag', 'sim'",
+    'topics = ["/a"]\n[source]\nkind = "bag"': "source.path is missing",
+    'topics = ["/a"]\n[source]\nkind = "bag"\npath = 5': "line 4: source.path is 5; write a path in quotes",
+    'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nspeed = 0': (
+        'line 5: source.speed is 0; write a factor above 0, such as 1.0 or 10, or "max"'
+    ),
+    'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nstart = "5s"\nstop = "2s"': "source ends before it begins",
+    'topics = ["/a"]\n[source]\nrobot = "a/b"': "source.robot is 'a/b'; it becomes part of a topic's name",
+    'topics = ["/a"]\n[spool]\nmax_size = "64 mib"': "line 3: spool.max_size is '64 mib'; write a size such as",
+    'topics = ["/a"]\n[spool]\nmax_records = 1.5': "line 3: spool.max_records is 1.5; it should be a whole number",
+    'topics = ["/a"]\n[spool]\nmax_records = 1': "line 3: spool.max_records is 1; it should be at least 16",
+    'topics = ["/a"]\nchannel = "transprot"': "allowed: 'exchange', 'transport'; did you mean 'transport'?",
+    'topics = ["/a"]\nserver = "host"': "line 2: server is 'host'; write HOST:PORT",
+    'topics = ["/a"]\nname = "Robot 1"': "line 2: name is 'Robot 1'; a name has 1 to 63 of a-z",
+    'topics = ["/a"]\nreaders = []': "it has no reader: nobody could open the records",
+    "topics = [": "is not TOML: ",
+    "topics = 1\ntopics = 2": "is not TOML: cannot overwrite a value",
+    "\x00": "is not TOML: ",
+}
+
+
+@pytest.mark.parametrize("text", MISTAKES, ids=range(len(MISTAKES)))
+def test_a_mistake_in_robot_toml_is_told(text):
+    with pytest.raises(ConfigError) as failure:
+        robot(text)
+    assert str(failure.value).startswith(str(FILE))
+    assert MISTAKES[text] in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("workers = 0", "line 1: workers is 0; it should be at least 1"),
+        ("channel = []", "line 1: channel is empty"),
+        ('channel = ["foo"]', "line 1: channel[0] is 'foo'; allowed: 'exchange', 'transport'"),
+        ('[chain]\ncontract = "0x12"', "chain.contract is '0x12'; an address is 0x and 40 hexadecimal digits"),
+        ("[chain]\nconfirmations = true", "chain.confirmations is true; it should be a whole number"),
+        ('[chain]\npoll = "2h"', "chain.poll is '2h'; it should be at most '1m'"),
+        ("[batch]\nsize = 10", "batch.size is 10; it should be at least 33792"),
+        ('[batch]\nsize = "1 KiB"', "batch.size is '1 KiB'; it should be at least '33 KiB'"),
+        ("[funds]\nby = 6", "funds.by is 6; it should be at most 5"),
+        ("[store]\nurl = 3", "store.url is 3; it should be a string in quotes"),
+        ("[batsh]\nsize = 10", "unknown key 'batsh'; did you mean 'batch'?"),
+    ],
+)
+def test_a_mistake_in_server_toml_is_told(text, sentence):
+    with pytest.raises(ConfigError) as failure:
+        server(text)
+    assert sentence in str(failure.value)
+
+
+def test_a_url_with_a_password_is_not_shown():
+    for text in ('[chain]\nurl = "htps://me:secretkey@node"', '[store]\nurl = "mysql://me:secretkey@host"'):
+        with pytest.raises(ConfigError) as failure:
+            server(text)
+        assert "secretkey" not in str(failure.value)
+    config = server('[chain]\nurl = "https://node/secretkey"\n[store]\nurl = "redis://:secretkey@host"')
+    assert "secretkey" not in repr(config)
+
+
+def test_all_mistakes_of_a_file_are_told_at_once():
+    with pytest.raises(ConfigError) as failure:
+        robot('topics = ["/a"]\nservr = "x:1"\nchannel = "y"\n[spool]\ncommit = "soon"\n')
+    for part in ("line 2: ", "'servr'", "line 3: ", "channel", "line 5: ", "spool.commit"):
+        assert part in str(failure.value)
+
+
+def test_a_reader_needs_contract_ca_and_identity():
+    with pytest.raises(ConfigError, match="contract is missing; ca is missing; identity is missing"):
+        parse_config(ReaderConfig, "", Path("reader.toml"))
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    for load in (load_robot_config, load_server_config, load_reader_config):
+        with pytest.raises(ConfigError, match=r"nowhere\.toml does not exist; create it"):
+            load(tmp_path / "nowhere.toml")
+        with pytest.raises(ConfigError, match="is a folder"):
+            load(tmp_path)
+        latin = tmp_path / "latin.toml"
+        latin.write_bytes("name = 'é'".encode("latin-1"))
+        with pytest.raises(ConfigError, match=r"is not UTF-8 \(byte 8\)"):
+            load(latin)
+        huge = tmp_path / "huge.toml"
+        huge.write_bytes(b"#" * (2 << 20))
+        with pytest.raises(ConfigError, match="a configuration has at most"):
+            load(huge)
+    good = tmp_path / "robot.toml"
+    good.write_text('topics = ["/a"]')
+    assert load_robot_config(good).topics[0].topic == "/a"
+
+
+def test_no_reader_is_an_error_with_the_way_out(tmp_path):
+    config = robot('topics = ["/a"]')
+    with pytest.raises(ConfigError, match="no reader: there is no certificate in"):
+        config.reader_files(tmp_path)
+    (tmp_path / "owner.pem").write_text("")
+    assert config.reader_files(tmp_path) == [tmp_path / "owner.pem"]
+    named = parse_config(RobotConfig, 'topics = ["/a"]\nreaders = ["alice.pem"]', tmp_path / "robot.toml")
+    with pytest.raises(ConfigError, match=r"alice\.pem does not exist"):
+        named.reader_files(tmp_path)
+    (tmp_path / "alice.pem").write_text("")
+    assert named.reader_files(tmp_path) == [tmp_path / "alice.pem"]
+
+
+def test_a_key_file_must_be_private(tmp_path):
+    key = tmp_path / "sign.key.pem"
+    with pytest.raises(IdentityError, match="does not exist"):
+        require_private(key)
+    key.write_text("")
+    for mode in (0o644, 0o640, 0o604, 0o620, 0o601):
+        os.chmod(key, mode)
+        with pytest.raises(IdentityError, match=rf"open to others \(mode {mode:04o}\); run `chmod 600"):
+            require_private(key)
+    for mode in (0o600, 0o400):
+        os.chmod(key, mode)
+        assert require_private(key) == key
+
+
+def test_a_missing_file_is_named_by_what_it_is(tmp_path):
+    with pytest.raises(ConfigError, match=r"CA certificate .*ca\.pem does not exist"):
+        require_file(tmp_path / "ca.pem", "CA certificate")
+    with pytest.raises(ConfigError, match="is a folder; name a file"):
+        require_file(tmp_path, "CA certificate")
+    (tmp_path / "ca.pem").write_text("")
+    assert require_file(tmp_path / "ca.pem", "CA certificate").name == "ca.pem"
