@@ -19,7 +19,6 @@ from smcrypto.sm4.ghash import GHASH
 
 __all__ = ["SM4CCM", "SM4GCM"]
 
-_TAG = 16
 _ZERO = bytes(16)
 _ONE = b"\0\0\0\1"
 # SP 800-38D, 5.2.1.1: 2^39 - 256 bits of plaintext, 2^64 - 1 bits of associated data and of nonce (whole bytes).
@@ -31,11 +30,20 @@ def _xor(a: bytes, b: bytes) -> bytes:
     return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
 
 
+def _checked_tag_length(tag_length: int, allowed: tuple[int, ...]) -> int:
+    if not isinstance(tag_length, int) or isinstance(tag_length, bool):
+        raise TypeError(f"tag_length must be an int, not {type(tag_length).__name__}")
+    if tag_length not in allowed:
+        raise InvalidLength(f"tag_length must be one of {', '.join(map(str, allowed))} bytes, not {tag_length}")
+    return tag_length
+
+
 class SM4GCM:
     """SM4 in Galois/Counter Mode: NIST SP 800-38D with the block cipher of GB/T 32907; RFC 8998.
 
-    key: 16 bytes, otherwise InvalidKey. One object serves any number of messages, in any number of threads,
-    and gets faster with use: it keeps tables for its key.
+    key: 16 bytes, otherwise InvalidKey. tag_length: 12 to 16 bytes, otherwise InvalidLength; shorter tags are for
+    what already exists. One object serves any number of messages, in any number of threads, and gets faster with
+    use: it keeps tables for its key.
 
     nonce: 1 byte or more, otherwise InvalidLength; 12 bytes are the fast and the usual form. No nonce may come
     twice under a key. With random nonces of 12 bytes a key serves at most 2^32 messages (SP 800-38D, 8.3).
@@ -48,20 +56,21 @@ class SM4GCM:
     b'message'
     """
 
-    __slots__ = ("_engine", "_ghash")
+    __slots__ = ("_engine", "_ghash", "_t")
 
-    def __init__(self, key: BytesLike) -> None:
+    def __init__(self, key: BytesLike, tag_length: int = 16) -> None:
         self._engine = Engine(as_bytes(key, "key"))
+        self._t = _checked_tag_length(tag_length, (12, 13, 14, 15, 16))  # SP 800-38D, 5.2.1.2
         self._ghash: GHASH | None = None
 
     def encrypt(self, nonce: BytesLike, data: BytesLike, associated_data: BytesLike = b"") -> bytes:
-        """`data` sealed: ciphertext ‖ 16-byte tag.
+        """`data` sealed: ciphertext ‖ tag of `tag_length` bytes.
 
         data: at most 2^36 - 32 bytes. associated_data: authenticated, not contained. Both may be empty;
         lengths beyond the standard's are InvalidLength. Source: SP 800-38D, 7.1.
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
-        _check_gcm_lengths(nonce, len(data), A)
+        _check_gcm_lengths(len(nonce), len(data), len(A))
         if self._ghash is None and len(nonce) == 12:  # the key's first message: E(K, 0^128) rides along
             J_0 = nonce + _ONE
             masks, C = self._engine.encrypt_and_ctr_xor(_ZERO + J_0, _inc32(J_0), data, 32)
@@ -78,17 +87,17 @@ class SM4GCM:
         InvalidTag as well. Source: SP 800-38D, 7.2.
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
-        _check_gcm_lengths(nonce, len(data) - _TAG, A)
-        if len(data) < _TAG:
+        _check_gcm_lengths(len(nonce), len(data) - self._t, len(A))
+        if len(data) < self._t:
             raise InvalidTag("the message is not authentic")
-        C, T = data[:-_TAG], data[-_TAG:]
+        C, T = data[: -self._t], data[-self._t :]
         J_0 = self._J_0(nonce)
         if not compare_digest(self._tag(self._engine.encrypt(J_0), A, C), T):
             raise InvalidTag("the message is not authentic")
         return self._engine.ctr_xor(_inc32(J_0), C, 32)
 
     def __repr__(self) -> str:
-        return "<SM4GCM>"
+        return f"<SM4GCM tag_length={self._t}>"
 
     def _hash(self, A: bytes, C: bytes) -> int:
         """GHASH_H(A ‖ pad ‖ C ‖ pad ‖ len(A) ‖ len(C)): steps 4 and 5 of 7.1."""
@@ -105,8 +114,8 @@ class SM4GCM:
         return self._hash(b"", nonce).to_bytes(16, "big")
 
     def _tag(self, mask: bytes, A: bytes, C: bytes) -> bytes:
-        """GHASH of the message XOR mask = E(K, J_0): step 6 of 7.1."""
-        return (self._hash(A, C) ^ int.from_bytes(mask, "big")).to_bytes(16, "big")
+        """GHASH of the message XOR mask = E(K, J_0), cut to t bytes: step 6 of 7.1."""
+        return (self._hash(A, C) ^ int.from_bytes(mask, "big")).to_bytes(16, "big")[: self._t]
 
 
 def _inc32(block: bytes) -> bytes:
@@ -114,12 +123,12 @@ def _inc32(block: bytes) -> bytes:
     return block[:12] + (int.from_bytes(block[12:], "big") + 1 & 0xFFFFFFFF).to_bytes(4, "big")
 
 
-def _check_gcm_lengths(nonce: bytes, text: int, A: bytes) -> None:
-    if not 1 <= len(nonce) <= _GCM_BYTES:
+def _check_gcm_lengths(nonce: int, text: int, A: int) -> None:
+    if not 1 <= nonce <= _GCM_BYTES:
         raise InvalidLength("nonce must be 1 byte or more")
     if text > _GCM_TEXT:
         raise InvalidLength(f"GCM takes at most 2^36 - 32 bytes (SP 800-38D, 5.2.1.1), not {text}")
-    if len(A) > _GCM_BYTES:
+    if A > _GCM_BYTES:
         raise InvalidLength("associated_data must be below 2^61 bytes (SP 800-38D, 5.2.1.1)")
 
 
@@ -145,11 +154,7 @@ class SM4CCM:
 
     def __init__(self, key: BytesLike, tag_length: int = 16) -> None:
         self._engine = Engine(as_bytes(key, "key"))
-        if not isinstance(tag_length, int) or isinstance(tag_length, bool):
-            raise TypeError(f"tag_length must be an int, not {type(tag_length).__name__}")
-        if tag_length not in (4, 6, 8, 10, 12, 14, 16):
-            raise InvalidLength(f"tag_length must be 4, 6, 8, 10, 12, 14 or 16 bytes, not {tag_length}")
-        self._t = tag_length
+        self._t = _checked_tag_length(tag_length, (4, 6, 8, 10, 12, 14, 16))  # SP 800-38C, A.1
 
     def encrypt(self, nonce: BytesLike, data: BytesLike, associated_data: BytesLike = b"") -> bytes:
         """`data` sealed: ciphertext ‖ tag of `tag_length` bytes.
