@@ -26,8 +26,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosbridge_eth.errors import IdentityError
-from smcrypto import InvalidTag
-from smcrypto.sm4 import SM4GCM
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
@@ -124,6 +122,8 @@ class Keyring:
 
     def seal(self, passphrase: bytes, *, n: int = SCRYPT_N) -> bytes:
         """The file that `open` reads; `n` is scrypt's cost."""
+        from smcrypto.sm4 import SM4GCM
+
         if not passphrase:
             raise IdentityError("an empty passphrase protects nothing; choose another")
         header: dict[str, Any] = {
@@ -140,6 +140,9 @@ class Keyring:
     @staticmethod
     def open(content: bytes, passphrase: bytes) -> Keyring:
         """The keyring of a sealed file; IdentityError if the passphrase or the file is wrong."""
+        from smcrypto import InvalidTag
+        from smcrypto.sm4 import SM4GCM
+
         try:
             header = json.loads(content)
             sealed = bytes.fromhex(header.pop("sealed"))

@@ -286,6 +286,10 @@ class Contract:
         """Merkle root of a batch; 32 zero bytes if the index is free."""
         return bytes(self._read("root", robot, batch_index, block=block)[0])
 
+    def merkle_root(self, robot: bytes, packed: bytes) -> bytes:
+        """What the contract makes of packed records; Reverted (MalformedRecords) if it cannot read them."""
+        return bytes(self._read("merkleRoot", robot, packed)[0])
+
     def check_data(
         self,
         record: SealedRecord,

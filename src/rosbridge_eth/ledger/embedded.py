@@ -93,7 +93,7 @@ class EmbeddedChain:
         }
         self._chain: Any = chain_class.from_genesis(AtomicDB(), genesis, state)
         self._clock = clock
-        self._auto_mine = auto_mine
+        self.auto_mine = auto_mine
         self._lock = threading.RLock()
         self._blocks = [_Mined(self._chain.get_canonical_block_header_by_number(0), (), ())]
         self._pool: dict[bytes, dict[int, Any]] = {}
@@ -151,7 +151,7 @@ class EmbeddedChain:
                     answers.append(self._accept(raw))
                 except NodeFailure as failure:
                     answers.append(failure)
-            if self._auto_mine and self._pool:
+            if self.auto_mine and self._pool:
                 self.mine()
         return answers
 
