@@ -339,7 +339,6 @@ class ChainConfig(Section):
         default=1, ge=1, le=10_000, description="Blocks, its own included, after which a transaction is confirmed."
     )
     poll: Seconds = Field(default=0.5, le=60, description="How often the node is asked about what is pending.")
-    poa: bool = Field(default=False, description="The chain is Clique proof of authority (long `extraData`).")
     bump_after: Seconds = Field(
         default=30.0,
         le=86_400,
