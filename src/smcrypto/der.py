@@ -93,8 +93,11 @@ _PRIMITIVE_ONLY: Final = frozenset(
      PRINTABLE_STRING, T61_STRING, IA5_STRING, UTC_TIME, GENERALIZED_TIME, VISIBLE_STRING, UNIVERSAL_STRING,
      BMP_STRING}
 )  # fmt: skip
-# The longest object identifier we read, in bytes of content; the longest in use have about twenty.
+# Bounds in bytes of content, far above what our structures hold (20, 33 and 2): what is longer is hostile, and
+# costs more than its size once it is printed in decimal or spread into a set.
 _MAX_OID: Final = 64
+_MAX_INTEGER: Final = 256
+_MAX_NAMED_BITS: Final = 16
 
 
 class Reader:
@@ -209,8 +212,8 @@ class Reader:
 
     def _number(self, start: int, end: int, signed: bool) -> int:
         data = self._data
-        if start == end:
-            raise InvalidEncoding(f"integer at byte {start} is empty")
+        if not 1 <= end - start <= _MAX_INTEGER:
+            raise InvalidEncoding(f"integer at byte {start} is empty, or longer than {_MAX_INTEGER} bytes")
         first = data[start]
         if end - start > 1 and (
             (first == 0x00 and data[start + 1] < 0x80) or (first == 0xFF and data[start + 1] >= 0x80)
@@ -341,6 +344,8 @@ def _split_bits(content: bytes) -> tuple[int, bytes]:
 
 def _bits(content: bytes) -> frozenset[int]:
     unused, body = _split_bits(content)
+    if len(body) > _MAX_NAMED_BITS:
+        raise InvalidEncoding(f"named bits are longer than {_MAX_NAMED_BITS} bytes")
     if body and not body[-1] & (1 << unused):
         raise InvalidEncoding("named bits end in zero bits (X.690, 11.2.2)")
     return frozenset(8 * i + j for i, byte in enumerate(body) for j in range(8) if byte & (0x80 >> j))

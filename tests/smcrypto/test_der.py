@@ -115,6 +115,8 @@ REFUSED = {
     "an object identifier cut off": ("060188", "oid"),
     "an arc with a leading 80 (8.19.2)": ("06038037 03", "oid"),
     "an endless object identifier": ("0641" + "01" * 65, "oid"),
+    "an integer of 257 bytes": ("02820101" + "01" * 257, "integer"),
+    "named bits of 17 bytes": ("031200" + "ff" * 17, "named_bits"),
     "a set out of order (11.6)": ("3106020102020101", "set_of"),
     "a tag number above 30": ("9f1f00", "raw"),
     "end-of-contents": ("0000", "raw"),

@@ -20,6 +20,7 @@ from smcrypto.errors import CertificateError, InvalidOption
 from smcrypto.inputs import BytesLike, as_bytes
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
+from smcrypto.x509.names import Name
 from smcrypto.x509.revocation import CertificateRevocationList, check_revocation
 from smcrypto.x509.signed import instant
 
@@ -107,7 +108,9 @@ class _Search:
         every: bool,
     ) -> None:
         self.roots = frozenset(roots)
-        self.candidates = tuple(dict.fromkeys(roots + intermediates))
+        self.issuers: dict[Name, list[Certificate]] = {}
+        for certificate in dict.fromkeys(roots + intermediates):
+            self.issuers.setdefault(certificate.subject, []).append(certificate)
         self.at = at
         self.uid = uid
         self.purposes = frozenset(map(ext.purpose_name, purposes))
@@ -132,7 +135,7 @@ class _Search:
             self.refused(path, CertificateError(f"the path is longer than {MAX_PATH} certificates"))
             return None
         found = False
-        for issuer in self.candidates:
+        for issuer in self.issuers.get(current.issuer, ()):
             self.steps += 1
             if self.steps > _MAX_STEPS:
                 raise _GivenUp(f"no path was found in {_MAX_STEPS} steps")
@@ -207,9 +210,7 @@ class _Search:
 
 
 def _may_have_issued(issuer: Certificate, certificate: Certificate) -> bool:
-    """Do the names chain, and the key identifiers where both are there?"""
-    if issuer.subject != certificate.issuer:
-        return False
+    """The names chain; do the key identifiers, where both are there?"""
     authority = certificate.authority_key_identifier
     if authority is None:
         return True

@@ -446,6 +446,20 @@ def scrypt(N: int, r: int, p: int, key_length: int | None = None) -> bytes:
     return der.sequence(der.oid("1.3.6.1.4.1.11591.4.11"), der.sequence(der.octet_string(b"salt"), numbers, length))
 
 
+@pytest.mark.parametrize("bits", [400, 40000])
+def test_absurd_numbers_are_refused_and_said_without_harm(bits: int) -> None:
+    number = 2**bits
+    for data, password in (
+        (der.sequence(der.integer(number), ALGORITHMS["the named curve"], der.octet_string(sec1())), None),
+        (der.sequence(der.integer(number), der.octet_string(bytes(32))), None),
+        (encrypted(iterations=number), b"pw"),
+        (encrypted(key_length=number), b"pw"),
+        (encrypted(derivation=scrypt(number, number, number)), b"pw"),
+    ):
+        with pytest.raises(InvalidKey):
+            sm2.PrivateKey.from_der(data, password)
+
+
 def test_the_helper_writes_what_is_read() -> None:
     assert sm2.PrivateKey.from_der(encrypted(), b"pw") == KEY
     assert sm2.PrivateKey.from_der(encrypted(key_length=16), b"pw") == KEY

@@ -428,6 +428,11 @@ def test_a_pile_of_intermediates_is_searched_within_bounds() -> None:
     refused("no path was found", layers[-1][0].issue("leaf"), *pile)
 
 
+def test_a_large_trust_store_is_no_pile() -> None:
+    strangers = [Holder(ROOT.key, root(f"stranger {i}", key=ROOT.key).certificate) for i in range(1100)]
+    assert len(verify(LEAF, *strangers, SUB, roots=[*strangers, ROOT])) == 3
+
+
 def test_many_bad_signatures_are_not_all_verified() -> None:
     bare = Holder(SUB.key, without_extension_of(SUB, "2.5.29.14"))
     leaf = bare.issue("leaf")
