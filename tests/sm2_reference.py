@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 
-from vectors_json import STANDARDS
-
 from smcrypto.sm2.curve import SM2P256V1, Curve, Point
+from vectors_json import STANDARDS
 
 
 def add(P: Point | None, Q: Point | None, curve: Curve) -> Point | None:

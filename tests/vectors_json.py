@@ -28,7 +28,7 @@ def _third_party() -> Path:
 
 def _decode(key: str, value: Any) -> Any:
     if isinstance(value, str) and key not in _TEXT:
-        return bytes.fromhex(value)
+        return bytes.fromhex(value.rjust(len(value) + len(value) % 2, "0"))  # numbers may have an odd digit
     if key == "msg_repeat":
         return bytes.fromhex(value["unit"]) * value["count"]
     return value

@@ -81,14 +81,15 @@ class KeyExchange:
         for key, kind, name in (
             (own_key, PrivateKey, "own_key"),
             (peer_public, PublicKey, "peer_public"),
-            (ephemeral_key or own_key, PrivateKey, "ephemeral_key"),
+            (own_key if ephemeral_key is None else ephemeral_key, PrivateKey, "ephemeral_key"),
         ):
             if not isinstance(key, kind):
                 raise TypeError(f"{name} must be a {kind.__name__}, not {type(key).__name__}")
         if not isinstance(initiator, bool):
             raise TypeError(f"initiator must be a bool, not {type(initiator).__name__}")
         self._curve = curve = own_key.curve
-        ephemeral_key = ephemeral_key or PrivateKey.generate(curve)
+        if ephemeral_key is None:
+            ephemeral_key = PrivateKey.generate(curve)
         if peer_public.curve != curve or ephemeral_key.curve != curve:
             raise InvalidKey("the keys are not of the same curve")
         own_z = z_value(curve, own_key.public_key.point, as_bytes(own_uid, "own_uid"))

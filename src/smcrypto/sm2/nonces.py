@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator
-from itertools import count
 
 from smcrypto.kdf import sm2_kdf
 
@@ -28,6 +27,8 @@ def hedged_nonces(
     n: int, label: bytes, secret: bytes, digest: bytes, *, entropy: Callable[[int], bytes] = secrets.token_bytes
 ) -> Iterator[int]:
     """Candidates for k in [1, n-1], without end; the first one nearly always serves."""
-    for attempt in count():
+    attempt = 0
+    while True:
         seed = label + secret + entropy(32) + digest + attempt.to_bytes(2, "big")
         yield int.from_bytes(sm2_kdf(seed, 64), "big") % (n - 1) + 1
+        attempt += 1

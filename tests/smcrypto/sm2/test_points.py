@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import product
 
 import pytest
-import sm2_reference as reference
 from hypothesis import given
 from hypothesis import strategies as st
-from sm2_reference import SAMPLE, TINY, TINY_17, TINY_61, TINY_79, TINY_1009
 
+import sm2_reference as reference
+from sm2_reference import SAMPLE, TINY, TINY_17, TINY_61, TINY_79, TINY_1009
 from smcrypto.sm2 import SM2P256V1, points
 from smcrypto.sm2.points import Comb, base_comb, odd_multiples, public_sum, secret_sum, to_affine
 

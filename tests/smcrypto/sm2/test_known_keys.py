@@ -1,0 +1,119 @@
+"""The memory of public keys: bounded, earned by success, correct for any order of use."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+import sm2_reference as reference
+from sm2_reference import TINY_61, TINY_1009
+from smcrypto import InvalidSignature, sm2
+from smcrypto.sm2 import SM2P256V1, encryption, exchange, signature
+from smcrypto.sm2.known_keys import KnownKeys, known_keys
+
+POINTS = [reference.multiple(k, TINY_1009.G, TINY_1009) for k in range(1, 40)]
+
+
+def use(memory: KnownKeys, P, times: int, curve=TINY_1009) -> None:
+    for _ in range(times):
+        memory.used(curve, P)
+
+
+def test_a_key_earns_a_comb_by_being_used():
+    memory = KnownKeys(uses=2)
+    P = POINTS[0]
+    assert memory.comb(TINY_1009, P) is None
+    use(memory, P, 1)
+    assert memory.comb(TINY_1009, P) is None
+    use(memory, P, 1)
+    comb = memory.comb(TINY_1009, P)
+    assert comb is not None
+    assert comb.curve is TINY_1009
+    assert comb is memory.comb(TINY_1009, P)
+    use(memory, P, 5)
+    assert comb is memory.comb(TINY_1009, P)
+    assert len(memory) == 1
+
+
+def test_the_same_point_of_another_curve_is_another_key():
+    memory = KnownKeys(uses=1)
+    use(memory, TINY_1009.G, 1)
+    assert memory.comb(TINY_61, TINY_1009.G) is None
+
+
+def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
+    memory = KnownKeys(combs=3, uses=1)
+    for P in POINTS[:3]:
+        use(memory, P, 1)
+        memory.comb(TINY_1009, P)
+    memory.comb(TINY_1009, POINTS[0])
+    use(memory, POINTS[3], 1)
+    memory.comb(TINY_1009, POINTS[3])
+    assert len(memory) == 3
+    assert memory.comb(TINY_1009, POINTS[0]) is not None
+    assert memory.comb(TINY_1009, POINTS[1]) is None
+    for P in POINTS:
+        use(memory, P, 1)
+        memory.comb(TINY_1009, P)
+        assert len(memory) <= 3
+
+
+def test_the_number_of_candidates_is_bounded():
+    memory = KnownKeys(candidates=5, uses=2)
+    for _ in range(3):
+        for P in POINTS[:10]:  # each forgotten before it comes round again
+            use(memory, P, 1)
+            assert memory.comb(TINY_1009, P) is None
+    assert len(memory._counts) == 5
+
+
+def test_only_signatures_that_hold_count(monkeypatch):
+    memory = KnownKeys(uses=1)
+    monkeypatch.setattr(signature, "known_keys", memory)
+    key = sm2.PrivateKey.generate()
+    signed = key.sign(b"message")
+    for _ in range(3):
+        with pytest.raises(InvalidSignature):
+            key.public_key.verify(signed, b"massage")
+    assert memory.comb(SM2P256V1, key.public_key.point) is None
+    key.public_key.verify(signed, b"message")
+    assert memory.comb(SM2P256V1, key.public_key.point) is not None
+
+
+def test_results_are_the_same_before_and_after_a_key_is_known(monkeypatch):
+    memory = KnownKeys(uses=3)
+    for module in (signature, encryption, exchange):
+        monkeypatch.setattr(module, "known_keys", memory)
+    key, peer = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
+    signed = key.sign(b"message")
+    r = sm2.PrivateKey.from_int(77)
+    outcomes = set()
+    for _ in range(6):
+        key.public_key.verify(signed, b"message")
+        with pytest.raises(InvalidSignature):
+            key.public_key.verify(signed, b"massage")
+        side = sm2.KeyExchange(peer, b"", key.public_key, b"", initiator=True, ephemeral_key=r)
+        outcomes.add(side.agree(sm2.PrivateKey.from_int(99).public_key.to_bytes(), 16))
+        outcomes.add(repr(encryption.encrypt(SM2P256V1, key.public_key.point, b"message", iter([1234567]))))
+    assert len(outcomes) == 2
+    assert len(memory) == 1
+
+
+def test_several_threads_share_the_memory():
+    memory = KnownKeys(combs=4, uses=2)
+
+    def work(i: int) -> None:
+        P = POINTS[i % 6]
+        comb = memory.comb(TINY_1009, P)
+        if comb is not None:
+            assert comb.rows[0][len(comb.rows[0]) // 2] == P
+        memory.used(TINY_1009, P)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(500)))
+    assert len(memory) <= 4
+
+
+def test_the_shared_memory_is_bounded():
+    assert known_keys._limits == (32, 1024)
