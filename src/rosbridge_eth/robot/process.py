@@ -54,6 +54,8 @@ class Robot:
         self._source_ended = threading.Event()
         self._source_error: BridgeError | None = None
         self._synchronised, self._asked_at = False, float("-inf")
+        self.spool_left = 0
+        """Records that the server had not acknowledged when `run` ended; the next run sends them."""
 
     def stop(self) -> None:
         """Let `run` come to an end, from any thread or a signal handler; what is not acknowledged stays spooled."""
@@ -89,6 +91,7 @@ class Robot:
             self._leave()
             self._source.close()
             reading.join(timeout=5)
+            self.spool_left = self.spool.statistics.records
             self.spool.close()
             self.loop.close()
         if self._source_error is not None:

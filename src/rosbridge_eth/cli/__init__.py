@@ -1,0 +1,42 @@
+"""The command line: parses, calls, prints. Data goes to stdout, talk to stderr.
+
+Exit codes are those of rosbridge_eth.errors.ExitCode; a failure a person can
+act on is one sentence on stderr and never a traceback.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import typer
+
+from rosbridge_eth.cli import demo, operator, reader, robot
+from rosbridge_eth.cli.output import talk
+from rosbridge_eth.errors import BridgeError, ExitCode
+
+app = typer.Typer(
+    name="rosbridge-eth",
+    help="From the name of a ROS topic to a verified record on an Ethereum chain.\n\n"
+    "Begin with `demo`; docs/walkthrough.md goes through everything else in ten minutes.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+for part in (demo, operator, robot, reader):
+    part.add_commands(app)
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    try:
+        app(args=None if arguments is None else list(arguments))
+    except BridgeError as error:
+        talk(f"rosbridge-eth: {error}")
+        return int(error.exit_code)
+    except SystemExit as stop:  # how typer ends: 0, or 2 for a usage error it has explained
+        return stop.code if isinstance(stop.code, int) else int(ExitCode.OK)
+    except KeyboardInterrupt:
+        talk("rosbridge-eth: interrupted")
+        return 130
+    return int(ExitCode.OK)

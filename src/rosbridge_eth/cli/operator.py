@@ -1,0 +1,349 @@
+"""The operator's commands: init, chain, deploy, register, reader, revoke, export, server, check, status."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import signal
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rosbridge_eth import ledger
+from rosbridge_eth.cli.options import OPERATOR_HOME, OperatorHomeOption, PassphraseFile, PasswordFile, Verbose
+from rosbridge_eth.cli.output import Json, data, log_to_stderr, print_json, table, talk
+from rosbridge_eth.config import load_server_config
+from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
+from rosbridge_eth.home import OperatorHome
+from rosbridge_eth.identity import Role
+from rosbridge_eth.passphrases import read_passphrase
+
+_ETH = 10**18
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth init --chain http://127.0.0.1:8545")(init)
+    app.command(epilog="Example: rosbridge-eth chain --port 8545")(chain)
+    app.command()(deploy)
+    app.command(epilog="Example: rosbridge-eth register robot_1")(register)
+    app.command(name="reader", epilog="Example: rosbridge-eth reader analyst")(add_reader)
+    app.command(epilog="Example: rosbridge-eth revoke robot_1")(revoke)
+    app.command(epilog="Example: rosbridge-eth export robot_1 keystore.json")(export)
+    app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
+    app.command(epilog="Example: rosbridge-eth check robot_1 0f3a… 17")(check)
+    app.command()(status)
+
+
+def _passphrase(file: Path | None, *, confirm: bool = False) -> bytes:
+    return read_passphrase("operator", "Operator passphrase", file=file, confirm=confirm)
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
+
+
+def init(
+    home: OperatorHomeOption = OPERATOR_HOME,
+    listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
+    public: Annotated[str | None, typer.Option(help="The address robots are given, where it differs.")] = None,
+    chain: Annotated[str, typer.Option(help="JSON-RPC URL of a node.")] = "http://127.0.0.1:8545",
+    server_name: Annotated[str, typer.Option(help="The name in the server's certificate.")] = "server",
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Make an operator's home: the CA, the server's identity, the seed of all accounts, the owner's reader key."""
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import init_home
+
+    place = OperatorHome(home)
+    passphrase = _passphrase(passphrase_file, confirm=True)
+    init_home(place, passphrase, listen=listen, public=public, chain_url=chain, server=server_name, now=_now())
+    keys = Keyring.load(place.accounts, passphrase)
+    talk(f"{home} is an operator's home. Keep its passphrase: nothing in it can be recovered without.")
+    talk(f"The operator's account is {keys.operator.address}; it pays for the contract and the robots.")
+    talk("Next: `chain` starts a local node (or put ETH on that account at yours), then `deploy`.")
+
+
+def chain(
+    home: OperatorHomeOption = OPERATOR_HOME,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port on 127.0.0.1.")] = 8545,
+    block_time: Annotated[
+        float | None, typer.Option(min=0.1, help="Seconds between blocks; without it each transaction gets its own.")
+    ] = None,
+    eth: Annotated[int, typer.Option(min=1, help="ETH on the operator's account.")] = 1000,
+) -> None:
+    """Start a local anvil whose chain is kept in a file of the home, and give the operator's account ETH on it."""
+    from rosbridge_eth.ledger.anvil import start
+
+    place = OperatorHome(home).require()
+    operator = jsonlib.loads(place.accounts.read_bytes())["operator"]
+    with start(port, state=home / "chain.json", block_time=block_time) as anvil:
+        node = ledger.connect(anvil.url)
+        if node.balance(operator) < eth * _ETH:
+            node.request("anvil_setBalance", operator, hex(eth * _ETH))
+        node.close()
+        talk(f"A local chain answers at {anvil.url}; {operator} has {eth} ETH. Ctrl-C ends it and keeps the chain.")
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            anvil.wait()
+        except KeyboardInterrupt:
+            talk("The chain is kept.")
+
+
+def deploy(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
+    """Create the contract on the configured chain."""
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import deploy_contract
+    from rosbridge_eth.server.assembly import open_chain
+
+    place = OperatorHome(home).require()
+    node = open_chain(load_server_config(place.config))
+    try:
+        made = deploy_contract(place, node, Keyring.load(place.accounts, _passphrase(passphrase_file)))
+    finally:
+        node.close()
+    talk(f"The contract is {made.contract} on chain {made.chain_id}. Next: `register NAME` for each robot.")
+
+
+def register(
+    name: Annotated[str, typer.Argument(help="The robot's name: a-z, 0-9, '_', '.', '-'.")],
+    home: OperatorHomeOption = OPERATOR_HOME,
+    replace: Annotated[bool, typer.Option("--replace", help="Take a used name over; revokes the old one.")] = False,
+    csr: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(help="The robot's own certificate requests, signing and encryption; its keys stay with it."),
+    ] = None,
+    passphrase_file: PassphraseFile = None,
+    password_file: PasswordFile = None,
+) -> None:
+    """Register a robot: name and password become an account, certificates, and a bundle to carry to the robot."""
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import load_ca, register_robot
+    from rosbridge_eth.server.assembly import open_chain
+
+    place = OperatorHome(home).require()
+    passphrase = _passphrase(passphrase_file)
+    password = read_passphrase("robot", f"Registration password of {name}", file=password_file, confirm=True)
+    node = open_chain(load_server_config(place.config))
+    try:
+        made = register_robot(
+            place, name, ca=load_ca(place, passphrase), keys=Keyring.load(place.accounts, passphrase), chain=node,
+            password=password, now=_now(), replace=replace, requests=None if csr is None else _requests(*csr),
+        )
+    finally:
+        node.close()
+    talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
+    talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
+
+
+def _requests(signing: Path, encryption: Path) -> Any:
+    from smcrypto import SMCryptoError, x509
+
+    try:
+        return tuple(x509.CertificateSigningRequest.from_pem(path.read_bytes()) for path in (signing, encryption))
+    except (OSError, SMCryptoError) as error:
+        raise IdentityError(f"a certificate request cannot be read: {error}") from error
+
+
+def add_reader(
+    name: Annotated[str, typer.Argument(help="The reader's name.")],
+    home: OperatorHomeOption = OPERATOR_HOME,
+    passphrase_file: PassphraseFile = None,
+    password_file: Annotated[
+        Path | None, typer.Option(help="Read the new reader's passphrase from the first line of this file.")
+    ] = None,
+) -> None:
+    """Make another reader; robots that are registered from now on seal for it too."""
+    from rosbridge_eth.server.administration import enrol_reader, load_ca
+
+    place = OperatorHome(home).require()
+    ca = load_ca(place, _passphrase(passphrase_file))
+    password = read_passphrase("reader", f"Passphrase of reader {name}", file=password_file, confirm=True)
+    folder = enrol_reader(place, name, ca=ca, password=password, now=_now())
+    talk(f"The keys of reader {name} are in {folder}.")
+
+
+def revoke(
+    name: Annotated[str, typer.Argument(help="The name to revoke.")],
+    home: OperatorHomeOption = OPERATOR_HOME,
+    role: Annotated[Role, typer.Option(help="What it is.")] = Role.ROBOT,
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Revoke a name: the server closes its session at once, and the chain takes nothing from it any more."""
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import revoke as revoke_name
+    from rosbridge_eth.server.assembly import open_chain
+
+    place = OperatorHome(home).require()
+    keys = Keyring.load(place.accounts, _passphrase(passphrase_file))
+    node = open_chain(load_server_config(place.config))
+    try:
+        block = revoke_name(place, role, name, keys=keys, chain=node, now=_now())
+    finally:
+        node.close()
+    talk(f"{role} {name} is revoked" + (f", on the chain in block {block}." if block is not None else "."))
+
+
+def export(
+    name: Annotated[str, typer.Argument(help="A robot's name, or `operator`.")],
+    file: Annotated[Path, typer.Argument(help="The keystore to write.")],
+    home: OperatorHomeOption = OPERATOR_HOME,
+    passphrase_file: PassphraseFile = None,
+    password_file: Annotated[
+        Path | None, typer.Option(help="Read the keystore's own password from the first line of this file.")
+    ] = None,
+) -> None:
+    """Write an account as a standard keystore that other Ethereum software imports."""
+    from rosbridge_eth.home import write_atomically
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.registry import Registry
+
+    place = OperatorHome(home).require()
+    if file.exists():
+        raise ConfigError(f"{file} exists; choose another name")
+    keys = Keyring.load(place.accounts, _passphrase(passphrase_file))
+    number = 0
+    if name != "operator":
+        found = Registry(place.registry).find(Role.ROBOT, name)
+        if found is None:
+            raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
+        number = found.number
+    password = read_passphrase("keystore", "Password of the keystore", file=password_file, confirm=True)
+    write_atomically(file, jsonlib.dumps(keys.export(number, password)).encode() + b"\n", mode=0o600)
+    talk(f"{file} holds the account {keys.account(number).address}.")
+
+
+def server(
+    home: OperatorHomeOption = OPERATOR_HOME,
+    workers: Annotated[int | None, typer.Option(min=1, max=64, help="Processes that share the port.")] = None,
+    passphrase_file: PassphraseFile = None,
+    verbose: Verbose = False,
+) -> None:
+    """Take records from robots and bring them onto the chain, until stopped."""
+    from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import load_server_identity
+    from rosbridge_eth.server.supervisor import Secrets, Supervisor
+
+    log_to_stderr(verbose)
+    place = OperatorHome(home).require()
+    config = load_server_config(place.config)
+    if workers is not None:
+        config = config.model_copy(update={"workers": workers})
+    passphrase = _passphrase(passphrase_file)
+    secrets = Secrets(load_server_identity(place, passphrase), Keyring.load(place.accounts, passphrase))
+
+    def ready(address: tuple[str, int]) -> None:
+        talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
+
+    Supervisor(place, config, secrets).run(ready)
+
+
+def check(
+    robot: Annotated[str, typer.Argument(help="The robot's name.")],
+    stream: Annotated[str, typer.Argument(help="The stream: 32 hex digits.")],
+    seq: Annotated[int, typer.Argument(min=0, help="The record's number in the stream.")],
+    home: OperatorHomeOption = OPERATOR_HOME,
+    json: Json = False,
+) -> None:
+    """Where is this record? Asks the store, and where it is in a block, the contract itself (checkData)."""
+    from rosbridge_eth.ledger import Contract, merkle
+    from rosbridge_eth.records import RecordId, robot_id
+    from rosbridge_eth.server.assembly import open_chain, open_inbox, open_journal
+    from rosbridge_eth.server.whereabouts import whereabouts
+
+    place = OperatorHome(home).require()
+    try:
+        id = RecordId(robot_id(robot), bytes.fromhex(stream), seq)
+    except ValueError as error:
+        raise ConfigError(f"not a record's identity: {error}") from error
+    config, deployment = load_server_config(place.config), place.deployment()
+    journal, inbox = open_journal(place, deployment), open_inbox(config, place)
+    found = whereabouts(id, inbox, journal, time.time())
+    proven: bool | None = None
+    if found.block is not None:
+        node = open_chain(config)
+        contract = Contract.at(node, deployment.contract)
+        for item in ledger.fetch(node, contract, id.robot, found.block, found.block).records:
+            if item.record.id == id:
+                batch = [other for other in ledger.fetch(node, contract, id.robot, found.block, found.block).records
+                         if other.batch_index == item.batch_index]
+                leaves = [merkle.leaf_hash(other.record) for other in batch]
+                path = merkle.proof(leaves, item.leaf)
+                proven = contract.check_data(item.record, item.batch_index, item.leaf, item.leaves, path)
+        node.close()
+    if json:
+        print_json({"state": found.state, "transaction": found.transaction, "block": found.block, "proven": proven})
+    else:
+        where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
+        data.print(f"{found.state}{where}" + ("" if proven is None else f"; the contract says {str(proven).lower()}"))
+    if proven is False:
+        raise VerificationError("the contract does not have the record that the store says it has")
+
+
+def status(home: OperatorHomeOption = OPERATOR_HOME, json: Json = False) -> None:
+    """What is where: names, queues, ages, dead letters, balances, the last block."""
+    from rosbridge_eth.registry import Registry
+    from rosbridge_eth.server.assembly import open_chain, open_inbox, open_journal
+
+    place = OperatorHome(home).require()
+    config = load_server_config(place.config)
+    names = Registry(place.registry).all()
+    report: dict[str, Any] = {
+        "names": [
+            {"role": n.role, "name": n.name, "account": n.account, "enrolled": n.enrolled_at.isoformat(),
+             "revoked": None if n.revoked_at is None else n.revoked_at.isoformat()}
+            for n in names
+        ],
+    }
+    if place.deployment_file.exists():
+        deployment = place.deployment()
+        inbox = open_inbox(config, place).statistics(time.time())
+        journal = open_journal(place, deployment)
+        report |= {
+            "contract": deployment.contract,
+            "chain": deployment.chain_id,
+            "inbox": {"waiting": inbox.waiting, "leased": inbox.leased, "done": inbox.done, "dead": inbox.dead,
+                      "bytes": inbox.bytes, "oldest_seconds": inbox.oldest_age},
+            "batches": {str(state): count for state, count in journal.counts().items()},
+            "dead_letters": len(journal.dead_letters()),
+        }
+        node = open_chain(config)
+        try:
+            report["block"] = node.head().number
+            operator = jsonlib.loads(place.accounts.read_bytes())["operator"]
+            accounts = [operator, *(n.account for n in names if n.account and n.revoked_at is None)]
+            report["balances"] = {account: node.balance(account) / _ETH for account in accounts}
+        except ledger.NodeFailure as failure:
+            report["node"] = str(failure)
+        finally:
+            node.close()
+    if json:
+        print_json(report)
+        return
+    _print_status(report)
+
+
+def _print_status(report: dict[str, Any]) -> None:
+    balances = report.get("balances", {})
+    rows = [
+        (n["role"], n["name"], n["account"] or "", f"{balances[n['account']]:.4f}" if n["account"] in balances else "",
+         "revoked" if n["revoked"] else "in force")
+        for n in report["names"]
+    ]
+    data.print(table("Names", ["role", "name", "account", "ETH", "state"], rows, right=[3]))
+    if "contract" not in report:
+        talk("No contract is deployed yet; run `deploy`.")
+        return
+    inbox = report["inbox"]
+    oldest = "" if inbox["oldest_seconds"] is None else f"{inbox['oldest_seconds']:.1f} s"
+    rows2 = [
+        ("contract", report["contract"]),
+        ("chain, block", f"{report['chain']}, {report.get('block', 'the node does not answer')}"),
+        ("inbox waiting", f"{inbox['waiting'] + inbox['leased']} (oldest {oldest or 'none'})"),
+        ("dead letters", inbox["dead"] + report["dead_letters"]),
+        *((f"batches {state}", count) for state, count in report["batches"].items()),
+    ]
+    data.print(table("Ledger", ["what", "value"], rows2))
+    if "node" in report:
+        talk(report["node"])
