@@ -84,10 +84,11 @@ def damage_error(path: Path, what: str, error: sqlite3.Error, *, move: bool) -> 
     number = 1
     while (aside := path.with_name(f"{path.name}.damaged-{number}")).exists():
         number += 1
+    reason = " ".join(str(error).split())
     salvage = f"'sqlite3 {aside} .recover' salvages what it held"
     if not move:
         return StoreError(
-            f"the {what} {path} is damaged ({error}); stop every process that uses it, move it and the files beside "
+            f"the {what} {path} is damaged ({reason}); stop every process that uses it, move it and the files beside "
             f"it ({', '.join(path.name + suffix for suffix in _BESIDE)}) to {aside}, and start again; {salvage}"
         )
     for suffix in ("", *_BESIDE):
@@ -95,7 +96,7 @@ def damage_error(path: Path, what: str, error: sqlite3.Error, *, move: bool) -> 
         if part.exists():
             part.rename(aside.with_name(aside.name + suffix))
     return StoreError(
-        f"the {what} {path} is damaged ({error}) and was kept as {aside}; "
+        f"the {what} {path} is damaged ({reason}) and was kept as {aside}; "
         f"start again to go on with an empty {what}; {salvage}"
     )
 

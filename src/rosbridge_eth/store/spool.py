@@ -16,7 +16,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import islice
@@ -109,8 +109,10 @@ class Spool:
         self._handed_to = 0
         self._returned: set[int] = set()
         self._dropped_to = dict.fromkeys(Delivery, 0)
-        self._lanes: dict[int, tuple[RecordId, _Row | None]] = {}  # the newest record of each
+        self._lanes: dict[int, tuple[RecordId, _Row | None]] = {}  # the newest record of each, while it is kept
+        self._lane_of: dict[int, int] = {}  # by place
         self._superseded = self._dropped = self._refused = 0
+        self._closed = False
         self._db = open_database(
             self._path, application=sql.SPOOL_APPLICATION, schema=sql.SPOOL_SCHEMA, what="spool", exclusive=True
         )
@@ -144,13 +146,16 @@ class Spool:
         self.close()
 
     def close(self) -> None:
-        """Write what is waiting and close; StoreError if it could not be written."""
+        """Write what is waiting and close; StoreError if it could not be written. Closing again does nothing."""
         with self._lock:
+            if self._closed:
+                return
             try:
                 self._write()
                 if self._trouble is not None:
                     raise StoreError(self._trouble)
             finally:
+                self._closed = True
                 self._db.close()
 
     @property
@@ -218,9 +223,7 @@ class Spool:
             if superseded:
                 self._forget(self._waiting.pop(id))
         else:
-            superseded = row.place not in self._removed and (
-                row.place > self._handed_to or row.place in self._returned
-            )
+            superseded = row.place > self._handed_to or row.place in self._returned
             if superseded:
                 self._remove(row)
         if superseded:
@@ -324,6 +327,9 @@ class Spool:
     def _remove(self, row: _Row) -> None:
         self._removed.add(row.place)
         self._returned.discard(row.place)
+        lane = self._lane_of.pop(row.place, None)
+        if lane is not None and self._lanes.get(lane, (None, None))[1] == row:
+            del self._lanes[lane]
         if row.delivery is not Delivery.CONTROL:
             self._records -= 1
             self._bytes -= row.size
@@ -373,6 +379,8 @@ class Spool:
         except sqlite3.Error as error:
             if is_damage(error):
                 raise self._damage(error) from None
+            if primary_code(error) == sqlite3.SQLITE_FULL:
+                self._shrink()
             self._trouble = (
                 f"the disk of the spool {self._path} is full; make room, what was kept before is safe"
                 if primary_code(error) == sqlite3.SQLITE_FULL
@@ -383,12 +391,19 @@ class Spool:
             id = waiting.record.id
             if waiting.lane is not None and self._lanes.get(waiting.lane) == (id, None):
                 self._lanes[waiting.lane] = id, row
+                self._lane_of[row.place] = waiting.lane
         self._waiting.clear()
         self._removed.clear()
         self._gaps.changed.clear()
         self._trouble = None
 
+    def _shrink(self) -> None:
+        """Move the write-ahead log into the file, if there is room for that: the log is then written from its start."""
+        with suppress(sqlite3.OperationalError):  # no room for that either: all is as it was
+            self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
     def _damage(self, error: sqlite3.Error) -> StoreError:
+        self._closed = True
         self._db.close()
         return damage_error(self._path, "spool", error, move=True)
 

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Protocol
 
 from rosbridge_eth.store import Inbox, InboxLimits, SqliteInbox
+from rosbridge_eth.store.inbox import DEFAULT_LIMITS
 
 
 class Backend(Protocol):
     def __init__(self, folder: Path) -> None: ...
 
-    def open(self, limits: InboxLimits = InboxLimits()) -> Inbox:
+    def open(self, limits: InboxLimits = DEFAULT_LIMITS) -> Inbox:
         """Another Inbox on the same data."""
         ...
 
@@ -33,7 +34,7 @@ class SqliteBackend:
     def __init__(self, folder: Path) -> None:
         self._path = folder / "inbox.db"
 
-    def open(self, limits: InboxLimits = InboxLimits()) -> Inbox:
+    def open(self, limits: InboxLimits = DEFAULT_LIMITS) -> Inbox:
         return SqliteInbox(self._path, limits)
 
     def opener_source(self) -> str:
