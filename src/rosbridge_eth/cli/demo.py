@@ -124,6 +124,6 @@ The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
 <h2>Records by stage</h2><table><tr><th>stage</th><th>records</th></tr>{rows(counts)}</table>
 <h2>Time</h2><table><tr><th>step</th><th>time</th></tr>{rows(times)}</table>
 <h2>Transactions</h2><table><tr>{"".join(f"<th>{head}</th>" for head in heads)}</tr>{rows(batches)}</table>
-<h2>Findings</h2>{"<p>None.</p>" if not findings else "<ul>" + "".join(f"<li>{escape(f)}</li>" for f in findings) + "</ul>"}
+<h2>Findings</h2><ul>{"".join(f"<li>{escape(found)}</li>" for found in findings or ["None."])}</ul>
 </html>
 """
