@@ -31,7 +31,7 @@ def wheel_speeds(seconds: float, lap: float) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=10.0, help="of odometry and of IMU, Hz")
     parser.add_argument("--seed", type=int, default=1, help="of the sensors' noise")

@@ -19,12 +19,12 @@ TWIST_VARIANCE = (1e-5, 1e-6, 1e6, 1e6, 1e6, 1e-4)
 """Of x, y, z and the three rotations; a planar robot knows nothing of z, roll and pitch (REP 105's 1e6)."""
 
 
-def diagonal(values):
+def diagonal(values: tuple[float, ...]) -> list[float]:
     size = len(values)
     return [values[i // size] if i % (size + 1) == 0 else 0.0 for i in range(size * size)]
 
 
-def odometry(robot, sample):
+def odometry(robot: str, sample: dict[str, float]) -> Odometry:
     message = Odometry()
     message.header.stamp = rospy.Time.now()
     message.header.frame_id = robot + "/odom"
@@ -40,7 +40,7 @@ def odometry(robot, sample):
     return message
 
 
-def imu(robot, sample):
+def imu(robot: str, sample: dict[str, list[float]]) -> Imu:
     message = Imu()
     message.header.stamp = rospy.Time.now()
     message.header.frame_id = robot + "/imu"
@@ -55,17 +55,21 @@ def imu(robot, sample):
     return message
 
 
-def main():
+def main() -> int:
     robot = "robot_1"
     rospy.init_node("base", disable_signals=True)
     topics = {
-        "odom": (rospy.Publisher("/%s/odom" % robot, Odometry, queue_size=100), odometry),
-        "imu": (rospy.Publisher("/%s/imu" % robot, Imu, queue_size=100), imu),
+        "odom": (rospy.Publisher(f"/{robot}/odom", Odometry, queue_size=100), odometry),
+        "imu": (rospy.Publisher(f"/{robot}/imu", Imu, queue_size=100), imu),
     }
     wait = rospy.Rate(20)
     while not all(publisher.get_num_connections() for publisher, _ in topics.values()):
         wait.sleep()
-    with subprocess.Popen(sys.argv[1:], stdout=subprocess.PIPE, universal_newlines=True) as robot_program:
+    with (
+        subprocess.Popen(  # noqa: S603 - the program that the caller names
+            sys.argv[1:], stdout=subprocess.PIPE, text=True
+        ) as robot_program
+    ):
         for line in robot_program.stdout:
             sample = json.loads(line)
             publisher, build = topics[sample["topic"]]

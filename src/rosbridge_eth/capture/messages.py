@@ -6,6 +6,7 @@ later (a live ROS 1 master, rclpy) needs to know nothing else of capture.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -34,6 +35,10 @@ MAX_ELEMENTS = 1 << 19
 Each becomes a Python object of a hundred bytes or more, where an array of
 numbers stays a view of the message.
 """
+
+
+_compiling = threading.Lock()
+"""rosbags registers each module it generates under one name in sys.modules: one thread at a time."""
 
 
 class DecodeError(SourceError):
@@ -76,7 +81,8 @@ class Decoder:
     def typestore(self) -> Typestore:
         """rosbags' type store with this type and what it refers to, and nothing else."""
         store = Typestore(max_sequence_length=MAX_RAW)
-        store.register(self.definition.typesdict())
+        with _compiling:
+            store.register(self.definition.typesdict())
         return store
 
     def decode(self, raw: bytes | memoryview) -> object:

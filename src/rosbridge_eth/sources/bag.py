@@ -8,6 +8,7 @@ Iron, sqlite3) is read with those that its distribution ships.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,6 +31,8 @@ from rosbridge_eth.capture import (
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
 from rosbridge_eth.sources.selection import Selection
+
+log = logging.getLogger(__name__)
 
 MAX_WAIT_NS = 3600 * 10**9
 """A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
@@ -76,12 +79,8 @@ class BagSource:
             self._start = reader.start_time
         try:
             self._offers = self._read_offers()
-            self._watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
-            self._decoders = {
-                connection.id: self._decoder(connection)
-                for connection, topic, _ in self._connections
-                if topic in self._watched
-            }
+            watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
+            self._decoders = self._read_definitions(watched, selection)
         except SourceError:
             self.close()
             raise
@@ -146,6 +145,24 @@ class BagSource:
             if isinstance(connection.ext, ConnectionExtRosbag1) and connection.ext.callerid:
                 publishers.add(connection.ext.callerid)
         return tuple(Offer(topic, name, tuple(sorted(found))) for (topic, name), found in sorted(nodes.items()))
+
+    def _read_definitions(self, watched: set[str], selection: Selection) -> dict[int, Decoder]:
+        """The decoders by connection. A topic that is only matched by a pattern is left out if it cannot be decoded."""
+        decoders: dict[int, Decoder] = {}
+        left_out: SourceError | None = None
+        for connection, topic, _ in self._connections:
+            if topic not in watched:
+                continue
+            try:
+                decoders[connection.id] = self._decoder(connection)
+            except SourceError as error:
+                if selection.names(topic):
+                    raise
+                left_out = error
+                log.warning("%s; the topic is left out", error)
+        if left_out is not None and not decoders:
+            raise left_out
+        return decoders
 
     def _decoder(self, connection: Connection) -> Decoder:
         definition = connection.msgdef

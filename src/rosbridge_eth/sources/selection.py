@@ -31,6 +31,10 @@ class Selection:
         """Whether nodes are to be watched: the source must know who publishes."""
         return bool(self._nodes)
 
+    def names(self, topic: str) -> bool:
+        """Whether the topic is asked for by its name, not by a pattern or a node."""
+        return any(pattern.is_exact and pattern.matches(topic) for pattern in self._topics)
+
     def wants(self, offer: Offer) -> bool:
         """Whether a topic is watched."""
         return any(pattern.matches(offer.topic) for pattern in self._topics) or any(

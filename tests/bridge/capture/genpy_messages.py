@@ -60,9 +60,8 @@ def in_a_record(kind, value):
     if kind == "bool":
         return bool(value)
     if isinstance(value, genpy.Message):
-        return {
-            name: in_a_record(inner, getattr(value, name)) for name, inner in zip(value.__slots__, value._slot_types)
-        }
+        members = zip(value.__slots__, value._slot_types, strict=True)
+        return {name: in_a_record(inner, getattr(value, name)) for name, inner in members}
     return value
 
 

@@ -9,6 +9,8 @@ from base64 import b64decode, b64encode
 from struct import pack
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rosbridge_eth.capture import Conversion, DecodeError, Wire, decoder_for
 from rosbridge_eth.capture.conversion import FieldTooLarge, to_json
@@ -264,3 +266,26 @@ def test_a_message_that_would_become_too_many_objects_is_not_decoded():
 def test_base64_gives_the_bytes_back():
     content = bytes(range(256))
     assert b64decode(ros1("uint8[256] d", content)["d"], validate=True) == content
+
+
+EVERYTHING_AT_ONCE = (
+    "Inner[] many\nInner[2] two\nstring[] names\nfloat32[] floats\nbool[] flags\nuint8[] data\n"
+    "time[] times\nduration d\nEmpty e\nint64 last\n"
+    + "=" * 80
+    + "\nMSG: pkg/Inner\nstring name\nfloat64[2] pair\nint8 x\n"
+    + "=" * 80
+    + "\nMSG: pkg/Empty\n"
+)
+
+
+@given(st.binary(max_size=200) | st.lists(st.sampled_from([0, 0, 0, 1, 2, 255]), max_size=300).map(bytes))
+@pytest.mark.parametrize("wire", list(Wire))
+def test_any_bytes_are_a_message_or_undecodable(wire, raw):
+    decoder = decoder_for(wire, "pkg/Type", EVERYTHING_AT_ONCE)
+    if wire is Wire.CDR:
+        raw = b"\x00\x01\x00\x00" + raw
+    try:
+        message = decoder.decode(raw)
+    except DecodeError:
+        return
+    json.loads(to_json(Conversion(decoder).convert(message)))

@@ -307,14 +307,20 @@ def test_a_recording_that_was_cut_off_names_the_mend(tmp_path):
         BagSource(BagSettings(path), Selection(["**"]))
 
 
-def test_a_hostile_definition_in_a_bag_is_refused_with_its_topic(tmp_path):
+def test_a_hostile_definition_in_a_bag_is_refused_with_its_topic(tmp_path, caplog):
     path = tmp_path / "hostile.bag"
     write_ros1(path)
     content = path.read_bytes()
     path.write_bytes(content.replace(b"bool ok", b"bool o'"))
-    with pytest.raises(SourceError, match=r"topic /custom: line \d+ .* is not a field"):
-        BagSource(BagSettings(path), Selection(["**"]))
-    assert len(replayed(path, "/names")) == 5, "other topics are not affected"
+    for selection in (Selection(["/custom"]), Selection(["/cust*"]), Selection(nodes=["/camera"])):
+        with pytest.raises(SourceError, match=r"topic /custom: line \d+ .* is not a field"):
+            BagSource(BagSettings(path), selection)
+    # Other topics are not affected, and a pattern that means it among others says so and goes on.
+    assert len(replayed(path, "/names")) == 5
+    caplog.clear()
+    assert {message.topic for message in replayed(path, "**")} == {"/names"}
+    assert "/custom" in caplog.text
+    assert "left out" in caplog.text
 
 
 def test_a_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
