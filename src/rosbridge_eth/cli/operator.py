@@ -236,10 +236,6 @@ def server(
     def ready(address: tuple[str, int]) -> None:
         talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
 
-
-    def ready(address: tuple[str, int]) -> None:
-        talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
-
     Supervisor(place, config, secrets).run(ready)
 
 
