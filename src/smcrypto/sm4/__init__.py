@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smcrypto.sm4.block import SM4
+from smcrypto.sm4.cipher import SM4
 from smcrypto.sm4.modes import (
     CBC,
     CFB,

@@ -5,19 +5,16 @@ FK and CK the constants of the key expansion, tau the S-box on four bytes,
 L and L' the linear maps, T = L.tau, T' = L'.tau. Words are 32-bit integers,
 most significant byte first (6.2).
 
-Two versions of the same function: `reference_crypt`, which can be read beside
-clauses 6 and 7 and is the oracle of all the tests, and `crypt_block`, one
-unrolled expression per round over tables that hold T of each byte.
+This file can be read beside clauses 6 and 7. It is the oracle of all the
+tests, and what the engines take their constants and tables from (tables for
+serial work, byteplanes and bitslice for many blocks at once).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from smcrypto.errors import InvalidKey
-from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
-
-__all__ = ["CK", "FK", "SBOX", "SM4", "crypt_block", "expand_key", "reference_crypt"]
+__all__ = ["CK", "FK", "SBOX", "L", "L_prime", "reference_crypt", "reference_expand_key"]
 
 FK = (0xA3B1BAC6, 0x56AA3350, 0x677D9197, 0xB27022DC)
 # ck[i][j] = (4i + j) * 7 mod 256, 7.3.2.
@@ -62,19 +59,21 @@ def _tau(word: int) -> int:
     return int.from_bytes(word.to_bytes(4, "big").translate(SBOX), "big")
 
 
-def _L(B: int) -> int:
+def L(B: int) -> int:
+    """6.2 b)."""
     return B ^ _rotl(B, 2) ^ _rotl(B, 10) ^ _rotl(B, 18) ^ _rotl(B, 24)
 
 
-def _L_prime(B: int) -> int:
+def L_prime(B: int) -> int:
+    """7.3 c)."""
     return B ^ _rotl(B, 13) ^ _rotl(B, 23)
 
 
-def expand_key(key: bytes) -> tuple[int, ...]:
+def reference_expand_key(key: bytes) -> tuple[int, ...]:
     """The 32 round keys of a 16-byte key, 7.3. Reversed, they decrypt (7.2)."""
     K = [int.from_bytes(key[4 * i : 4 * i + 4], "big") ^ FK[i] for i in range(4)]
     for i in range(32):
-        K.append(K[i] ^ _L_prime(_tau(K[i + 1] ^ K[i + 2] ^ K[i + 3] ^ CK[i])))
+        K.append(K[i] ^ L_prime(_tau(K[i + 1] ^ K[i + 2] ^ K[i + 3] ^ CK[i])))
     return tuple(K[4:])
 
 
@@ -82,42 +81,5 @@ def reference_crypt(rk: Sequence[int], block: bytes) -> bytes:
     """One 16-byte block through the 32 rounds of 7.1, as the standard writes it."""
     X = [int.from_bytes(block[4 * i : 4 * i + 4], "big") for i in range(4)]
     for i in range(32):
-        X.append(X[i] ^ _L(_tau(X[i + 1] ^ X[i + 2] ^ X[i + 3] ^ rk[i])))
+        X.append(X[i] ^ L(_tau(X[i + 1] ^ X[i + 2] ^ X[i + 3] ^ rk[i])))
     return b"".join(word.to_bytes(4, "big") for word in reversed(X[32:]))
-
-
-def crypt_block(rk: Sequence[int], block: bytes) -> bytes:
-    """The same function."""
-    return reference_crypt(rk, block)
-
-
-class SM4:
-    """The bare block cipher, GB/T 32907-2016: one block of 16 bytes at a time.
-
-    key: 16 bytes, otherwise InvalidKey. Data of other lengths needs a mode
-    (`encrypt`, `Cipher`) or, better, `SM4GCM`, which also detects changes.
-
-    >>> key = bytes.fromhex("0123456789abcdeffedcba9876543210")
-    >>> SM4(key).encrypt_block(key).hex()
-    '681edf34d206965e86b3e94f536e4246'
-    """
-
-    __slots__ = ("_decrypt_keys", "_encrypt_keys")
-
-    block_size = 16
-    key_size = 16
-
-    def __init__(self, key: BytesLike) -> None:
-        key = as_bytes(key, "key")
-        if len(key) != 16:
-            raise InvalidKey(f"an SM4 key is 16 bytes, not {len(key)}")
-        self._encrypt_keys = expand_key(key)
-        self._decrypt_keys = self._encrypt_keys[::-1]
-
-    def encrypt_block(self, block: BytesLike) -> bytes:
-        """The 16-byte ciphertext of a 16-byte block; another length is InvalidLength."""
-        return crypt_block(self._encrypt_keys, as_exact_bytes(block, "block", 16))
-
-    def decrypt_block(self, block: BytesLike) -> bytes:
-        """The 16-byte plaintext of a 16-byte block; another length is InvalidLength."""
-        return crypt_block(self._decrypt_keys, as_exact_bytes(block, "block", 16))

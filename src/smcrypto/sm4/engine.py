@@ -1,37 +1,96 @@
-"""One expanded key, and the fastest engine for any number of independent blocks."""
+"""One expanded key, and the fastest engine for any number of independent blocks.
+
+CROSSOVERS
+"""
 
 from __future__ import annotations
 
-from smcrypto.errors import InvalidKey
-from smcrypto.sm4.block import crypt_block, expand_key
+import struct
+from collections.abc import Sequence
 
-__all__ = ["Engine"]
+from smcrypto.errors import InvalidKey
+from smcrypto.sm4 import bitslice, byteplanes, tables
+
+__all__ = ["Engine", "counter_blocks", "xor_bytes"]
+
+FEW_BLOCKS = 2  # up to here: one by one
+BULK_BLOCKS = 3072  # from here: bit slices
+_PLANE_BLOCKS = 1024  # at most so many at once as byte planes: more leave the cache
+
+
+def xor_bytes(a: bytes, b: bytes) -> bytes:
+    """a XOR b, of equal lengths."""
+    return (int.from_bytes(a) ^ int.from_bytes(b)).to_bytes(len(a))
+
+
+def counter_blocks(first: bytes, n: int, counter_bits: int) -> bytes:
+    """The blocks `first`, `first` + 1, ...: the low `counter_bits` count, big-endian, and wrap."""
+    number = int.from_bytes(first)
+    low = number & 0xFFFFFFFF
+    modulus = 1 << counter_bits
+    if number % modulus + n > modulus or low + n > 1 << 32:  # a wrap, or a carry beyond the last word: plainly
+        fixed = number & -modulus
+        return b"".join([(fixed | (number + i) % modulus).to_bytes(16) for i in range(n)])
+    blocks = bytearray(first * n)
+    last_words = struct.pack(f">{n}I", *range(low, low + n))
+    for j in range(4):
+        blocks[12 + j :: 16] = last_words[j::4]
+    return bytes(blocks)
+
+
+class _RoundKeys:
+    """The round keys in one direction; their forms for the parallel engines are kept for the last size.
+
+    Size and keys are one tuple, replaced as one: threads may share an engine.
+    """
+
+    __slots__ = ("_bytes", "_planes", "rk")
+
+    def __init__(self, rk: Sequence[int]) -> None:
+        self.rk = rk
+        self._bytes: tuple[int, list[int]] = (0, [])
+        self._planes: tuple[int, list[list[int]]] = (0, [])
+
+    def for_bytes(self, n: int) -> list[int]:
+        size, keys = self._bytes
+        if size != n:
+            keys = byteplanes.key_words(self.rk, n)
+            self._bytes = n, keys
+        return keys
+
+    def for_planes(self, width: int) -> list[list[int]]:
+        size, keys = self._planes
+        if size != width:
+            keys = bitslice.key_planes(self.rk, width)
+            self._planes = width, keys
+        return keys
 
 
 class Engine:
-    """The internal workhorse under every mode: it trusts its callers to have checked types and lengths.
+    """What every mode stands on. It trusts its callers to have checked types and lengths, all but the key's.
 
-    encrypt, decrypt: any number of whole, independent blocks, in one call.
-    ctr_xor: the counter mode's stream over data of any length.
+    key: 16 bytes, otherwise InvalidKey.
+    encrypt, decrypt   whole, independent blocks, any number in one call
+    ctr_xor            the counter mode's stream over data of any length
+    cbc_encrypt, ...   what is serial by nature, block after block
     """
 
-    __slots__ = ("_decrypt_keys", "_encrypt_keys")
+    __slots__ = ("_decrypting", "_encrypting")
 
     def __init__(self, key: bytes) -> None:
         if len(key) != 16:
             raise InvalidKey(f"an SM4 key is 16 bytes, not {len(key)}")
-        self._encrypt_keys = expand_key(key)
-        self._decrypt_keys = self._encrypt_keys[::-1]
+        rk = tables.expand_key(key)
+        self._encrypting = _RoundKeys(rk)
+        self._decrypting = _RoundKeys(rk[::-1])
 
-    def encrypt(self, blocks: bytes) -> bytes:
-        """ECB over whole blocks."""
-        rk = self._encrypt_keys
-        return b"".join(crypt_block(rk, blocks[i : i + 16]) for i in range(0, len(blocks), 16))
+    def encrypt(self, blocks: bytes, mask: bytes | None = None) -> bytes:
+        """Each block encrypted; XOR `mask`, of the same length, if there is one."""
+        return _crypt(self._encrypting, blocks, mask)
 
-    def decrypt(self, blocks: bytes) -> bytes:
-        """The inverse of `encrypt`."""
-        rk = self._decrypt_keys
-        return b"".join(crypt_block(rk, blocks[i : i + 16]) for i in range(0, len(blocks), 16))
+    def decrypt(self, blocks: bytes, mask: bytes | None = None) -> bytes:
+        """Each block decrypted; XOR `mask`, of the same length, if there is one."""
+        return _crypt(self._decrypting, blocks, mask)
 
     def ctr_xor(self, first: bytes, data: bytes, counter_bits: int = 128) -> bytes:
         """`data` XOR the encryptions of `first`, `first` + 1, ...
@@ -50,14 +109,47 @@ class Engine:
         GCM needs E(0^128), E(J0) and the key stream for every message;
         beside the key stream the two single blocks cost next to nothing.
         """
-        count = -(-len(data) // 16)
-        mask = (1 << counter_bits) - 1
-        start = int.from_bytes(first, "big")
-        high, low = start & ~mask, start & mask
-        counters = b"".join((high | ((low + i) & mask)).to_bytes(16, "big") for i in range(count))
-        out = self.encrypt(blocks + counters)
+        n = -(-len(data) // 16)
+        if n >= BULK_BLOCKS:
+            return self.encrypt(blocks), self._ctr_bulk(int.from_bytes(first), data, n, counter_bits)
+        out = self.encrypt(blocks + counter_blocks(first, n, counter_bits))
         split = len(blocks)
-        stream = int.from_bytes(out[split : split + len(data)], "big")
-        return out[:split], (stream ^ int.from_bytes(data, "big")).to_bytes(len(data), "big")
+        return out[:split], xor_bytes(data, out[split : split + len(data)])
+
+    def _ctr_bulk(self, first: int, data: bytes, n: int, counter_bits: int) -> bytes:
+        width = bitslice.chunk_width(n)
+        keys = self._encrypting.for_planes(width)
+        modulus = 1 << counter_bits
+        pieces = []
+        for start in range(0, n, 128 * width):
+            counter = first & -modulus | (first + start) % modulus
+            piece = data[16 * start : 16 * (start + 128 * width)]
+            pieces.append(bitslice.ctr_xor(keys, counter, piece, width, counter_bits))
+        return b"".join(pieces)
+
+    def cbc_encrypt(self, chain: bytes, blocks: bytes) -> bytes:
+        """C_i = E(P_i ^ C_(i-1)), C_0 being `chain`. The last block is the CBC-MAC."""
+        return tables.cbc_encrypt(self._encrypting.rk, chain, blocks)
+
+    def cfb_encrypt(self, chain: bytes, blocks: bytes) -> bytes:
+        """C_i = P_i ^ E(C_(i-1)), C_0 being `chain`. On zeros this is OFB's key stream."""
+        return tables.cfb_encrypt(self._encrypting.rk, chain, blocks)
 
 
+def _crypt(keys: _RoundKeys, blocks: bytes, mask: bytes | None) -> bytes:
+    """Whole blocks, in equal chunks of the engine that suits their number."""
+    n = len(blocks) // 16
+    if n >= BULK_BLOCKS:
+        width = bitslice.chunk_width(n)
+        plane_keys, size = keys.for_planes(width), 2048 * width
+        chunks = [slice(start, start + size) for start in range(0, len(blocks), size)]
+        return b"".join(
+            [bitslice.crypt_xor(plane_keys, blocks[c], None if mask is None else mask[c], width) for c in chunks]
+        )
+    if n > FEW_BLOCKS:
+        size = 16 * -(-n // -(-n // _PLANE_BLOCKS))
+        pieces = [blocks[start : start + size] for start in range(0, len(blocks), size)]
+        out = b"".join([byteplanes.crypt(keys.for_bytes(len(piece) // 16), piece) for piece in pieces])
+    else:
+        out = b"".join([tables.crypt_block(keys.rk, blocks[i : i + 16]) for i in range(0, len(blocks), 16)])
+    return out if mask is None else xor_bytes(out, mask)

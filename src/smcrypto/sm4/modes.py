@@ -16,16 +16,12 @@ from typing import Literal, Protocol, TypeAlias
 
 from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding
 from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
-from smcrypto.sm4.engine import Engine
+from smcrypto.sm4.engine import Engine, xor_bytes
 from smcrypto.sm4.xts import Variant, XTSStream, check_variant
 
 __all__ = ["CBC", "CFB", "CTR", "ECB", "OFB", "XTS", "Cipher", "CipherStream", "Mode", "Padding", "decrypt", "encrypt"]
 
 Padding: TypeAlias = Literal["pkcs7"] | None
-
-
-def _xor(a: bytes, b: bytes) -> bytes:
-    return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,11 +128,9 @@ class _CBCEncrypt:
         self._engine, self._chain = engine, iv
 
     def __call__(self, blocks: bytes) -> bytes:
-        out = []
-        for i in range(0, len(blocks), 16):
-            self._chain = self._engine.encrypt(_xor(blocks[i : i + 16], self._chain))
-            out.append(self._chain)
-        return b"".join(out)
+        out = self._engine.cbc_encrypt(self._chain, blocks)
+        self._chain = (self._chain + out)[-16:]
+        return out
 
 
 class _CBCDecrypt:
@@ -146,7 +140,7 @@ class _CBCDecrypt:
     def __call__(self, blocks: bytes) -> bytes:
         chained = self._chain + blocks
         self._chain = chained[-16:]
-        return _xor(self._engine.decrypt(blocks), chained[: len(blocks)])
+        return self._engine.decrypt(blocks, chained[: len(blocks)])
 
 
 class _KeyStream:
@@ -157,14 +151,14 @@ class _KeyStream:
         self._left = b""
 
     def update(self, data: bytes) -> bytes:
-        head = data[: len(self._left)]
-        stream, self._left = self._left[: len(head)], self._left[len(head) :]
-        rest = data[len(head) :]
-        padded = rest + bytes(-len(rest) % 16)
-        out = self._xor_stream(padded)
-        if len(padded) > len(rest):
-            self._left = out[len(rest) :]
-        return _xor(head, stream) + out[: len(rest)]
+        head, data = data[: len(self._left)], data[len(self._left) :]
+        out = xor_bytes(head, self._left[: len(head)])
+        self._left = self._left[len(head) :]
+        if not data:
+            return out
+        masked = self._xor_stream(data + bytes(-len(data) % 16))
+        self._left = masked[len(data) :]  # zeros XOR stream
+        return out + masked[: len(data)] if head else masked[: len(data)]
 
     def finalize(self) -> bytes:
         return b""
@@ -172,47 +166,59 @@ class _KeyStream:
 
 class _CTR:
     def __init__(self, engine: Engine, nonce: bytes) -> None:
-        self._engine, self._counter = engine, int.from_bytes(nonce, "big")
+        self._engine, self._counter = engine, int.from_bytes(nonce)
 
     def __call__(self, data: bytes) -> bytes:
-        first = self._counter.to_bytes(16, "big")
+        first = self._counter.to_bytes(16)
         self._counter = (self._counter + len(data) // 16) % (1 << 128)
         return self._engine.ctr_xor(first, data)
 
 
 class _OFB:
     def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._register = engine, iv
+        self._engine, self._chain = engine, iv
 
     def __call__(self, data: bytes) -> bytes:
-        stream = []
-        for _ in range(0, len(data), 16):
-            self._register = self._engine.encrypt(self._register)
-            stream.append(self._register)
-        return _xor(data, b"".join(stream))
+        stream = self._engine.cfb_encrypt(self._chain, bytes(len(data)))
+        self._chain = stream[-16:]
+        return xor_bytes(data, stream)
 
 
 class _CFB:
-    """CFB-128: the register is the last 16 bytes of ciphertext; an incomplete block waits for the rest of it."""
+    """CFB-128. The chain is the ciphertext block before; of a block under way, what has come of it.
+
+    A block under way is masked with what is left of E(the block before).
+    """
 
     def __init__(self, engine: Engine, iv: bytes, *, encrypting: bool) -> None:
         self._engine, self._encrypting = engine, encrypting
-        self._mask = b""
-        self._register = iv
+        self._chain, self._mask = iv, b""
 
     def update(self, data: bytes) -> bytes:
-        out = []
-        position = 0
-        while position < len(data):
-            if not self._mask:
-                self._mask, self._register = self._engine.encrypt(self._register), b""
-            piece = data[position : position + len(self._mask)]
-            mask, self._mask = self._mask[: len(piece)], self._mask[len(piece) :]
-            result = _xor(piece, mask)
-            self._register += result if self._encrypting else piece
-            out.append(result)
-            position += len(piece)
-        return b"".join(out)
+        out = self._within_block(data[: len(self._mask)])
+        data = data[len(out) :]
+        whole = len(data) & ~15
+        if whole:
+            out += self._blocks(data[:whole])
+        if whole < len(data):
+            self._mask, self._chain = self._engine.encrypt(self._chain), b""
+            out += self._within_block(data[whole:])
+        return out
+
+    def _within_block(self, piece: bytes) -> bytes:
+        out = xor_bytes(piece, self._mask[: len(piece)])
+        self._mask = self._mask[len(piece) :]
+        self._chain += out if self._encrypting else piece
+        return out
+
+    def _blocks(self, blocks: bytes) -> bytes:
+        if self._encrypting:
+            out = self._engine.cfb_encrypt(self._chain, blocks)
+            self._chain = out[-16:]
+            return out
+        chained = self._chain + blocks
+        self._chain = chained[-16:]
+        return self._engine.encrypt(chained[: len(blocks)], blocks)
 
     def finalize(self) -> bytes:
         return b""

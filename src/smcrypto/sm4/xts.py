@@ -16,7 +16,7 @@ from hmac import compare_digest
 from typing import Literal, TypeAlias
 
 from smcrypto.errors import InvalidKey, InvalidLength, InvalidOption
-from smcrypto.sm4.engine import Engine
+from smcrypto.sm4.engine import Engine, xor_bytes
 
 __all__ = ["Variant", "XTSStream", "check_variant"]
 
@@ -27,10 +27,6 @@ def check_variant(variant: str) -> None:
     """InvalidOption unless it is one of the two."""
     if variant not in ("gb", "ieee"):
         raise InvalidOption('variant must be "gb" or "ieee"')
-
-
-def _xor(a: bytes, b: bytes) -> bytes:
-    return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
 
 
 def _double_gb(tweak: bytes) -> bytes:
@@ -67,7 +63,7 @@ class XTSStream:
             tweaks.append(self._tweak)
             self._tweak = self._double(self._tweak)
         mask = b"".join(tweaks)
-        return _xor(self._crypt(_xor(data, mask)), mask)
+        return xor_bytes(self._crypt(xor_bytes(data, mask)), mask)
 
     def update(self, data: bytes) -> bytes:
         data = self._pending + data
@@ -85,5 +81,5 @@ class XTSStream:
         if not self._encrypting:
             first, second = second, first
         full, rest = pending[:16], pending[16:]
-        stolen = _xor(self._crypt(_xor(full, first)), first)
-        return _xor(self._crypt(_xor(rest + stolen[len(rest):], second)), second) + stolen[: len(rest)]
+        stolen = xor_bytes(self._crypt(xor_bytes(full, first)), first)
+        return xor_bytes(self._crypt(xor_bytes(rest + stolen[len(rest):], second)), second) + stolen[: len(rest)]
