@@ -75,8 +75,8 @@ def walk(P: Jacobian, steps: Iterable[tuple[int, Sequence[Point]]], curve: Curve
                 C = B * X % p
                 alpha = (3 * (X - ZZ) * (X + ZZ) if minus_three else 3 * X * X + a * (ZZ * ZZ % p)) % p
                 Z = T * Z % p
-                X = (alpha * alpha - 2 * C) % p
-                T = (2 * alpha * (C - X) - B * B) % p
+                X = (alpha * alpha - C - C) % p
+                T = ((alpha + alpha) * (C - X) - B * B) % p
             Y = T + (T & 1) * p >> 1
         for x2, y2 in addends:
             ZZ = Z * Z % p
@@ -89,7 +89,7 @@ def walk(P: Jacobian, steps: Iterable[tuple[int, Sequence[Point]]], curve: Curve
             HHH = H * HH % p
             V = X * HH % p
             Z = Z * H % p
-            X = (r * r - HHH - 2 * V) % p
+            X = (r * r - HHH - V - V) % p
             Y = (r * (V - X) - Y * HHH) % p
     return X, Y, Z
 
@@ -126,7 +126,7 @@ def add_all(P: Extended, addends: Iterable[Point], curve: Curve) -> Extended:
         HH = H * H % p
         HHH = H * HH % p
         V = X * HH % p
-        X = (r * r - HHH - 2 * V) % p
+        X = (r * r - HHH - V - V) % p
         Y = (r * (V - X) - Y * HHH) % p
         ZZ = ZZ * HH % p
         ZZZ = ZZZ * HHH % p
