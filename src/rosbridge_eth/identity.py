@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
 
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.records import robot_id
@@ -227,7 +226,7 @@ class Trust:
     roots: Sequence[x509.Certificate]
     intermediates: Sequence[x509.Certificate] = ()
     allowed: Callable[[PeerIdentity], bool] | None = None
-    crls: Sequence[Any] = ()
+    crls: Sequence[x509.CertificateRevocationList] = ()
 
     def check(
         self,

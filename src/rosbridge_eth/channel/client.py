@@ -297,7 +297,7 @@ class Client:
         if (
             handshake is None
             or cookie.client_cid != self._cid
-            or not hmac.compare_digest(cookie.nonce_half, handshake.hello.nonce[:16])
+            or not hmac.compare_digest(cookie.nonce, handshake.hello.nonce)
         ):
             self._counters.drop(Drop.UNEXPECTED)
             return
@@ -343,13 +343,13 @@ class Client:
         self._outbox = []
 
     def _on_refusal(self, data: bytes) -> None:
-        cid, half, reason = parse_refusal(data)
+        cid, nonce, reason = parse_refusal(data)
         handshake = self._handshake
         if (
             self.state is not ClientState.PROVING
             or handshake is None
             or cid != self._cid
-            or not hmac.compare_digest(half, handshake.hello.nonce[:16])
+            or not hmac.compare_digest(nonce, handshake.hello.nonce)
         ):
             self._counters.drop(Drop.UNEXPECTED)
             return

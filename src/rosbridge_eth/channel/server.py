@@ -1,6 +1,6 @@
 """A server of the channel: one process's connections. Sans-IO.
 
-What a stranger can cost: a HELLO, one keyed hash and a COOKIE of 51 bytes for
+What a stranger can cost: a HELLO, one keyed hash and a COOKIE of 66 bytes for
 1,200; a PROOF piece with a good cookie, one of `max_half_open` places; a whole
 PROOF, signatures, within `source_rate` and `handshake_share`. DATA of unknown
 connections costs a look-up, and at most `reset_rate` resets a second.
@@ -301,7 +301,7 @@ class Server:
             return
         cookie = self._cookies.make(address, hello.mode, hello.client_cid, hello.nonce, now)
         self._counters.count["cookies"] += 1
-        answer = Cookie(hello.client_cid, hello.nonce[:16], cookie)
+        answer = Cookie(hello.client_cid, hello.nonce, cookie)
         self._outbox.append((answer.to_bytes(), address))
 
     def _on_proof(self, data: bytes, address: Address, now: float) -> None:
@@ -377,7 +377,7 @@ class Server:
             half_open.state = advance(SERVER, half_open.state, ServerInput.REFUSED)
             del self._half_open[key]
             if refused.hint is not None:
-                answer = refusal_datagram(piece.client_cid, piece.nonce[:16], refused.hint)
+                answer = refusal_datagram(piece.client_cid, piece.nonce, refused.hint)
                 self._outbox.append((answer, address))
             return
         half_open.state = advance(SERVER, half_open.state, ServerInput.PROOF)

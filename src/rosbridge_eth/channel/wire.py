@@ -90,7 +90,7 @@ class Frame(IntEnum):
 
 _HELLO = struct.Struct(">BBB8s32s")
 _HELLO_PADDING = bytes(DATAGRAM_SIZE - _HELLO.size)
-_COOKIE = struct.Struct(">BB8s16s24s")
+_COOKIE = struct.Struct(">BB8s32s24s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,23 +114,23 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Cookie:
-    """COOKIE: kind, version, client's connection id (8), first half of N (16), cookie (24)."""
+    """COOKIE: kind, version, client's connection id (8), N (32), cookie (24)."""
 
     client_cid: bytes
-    nonce_half: bytes
+    nonce: bytes
     cookie: bytes
 
     def to_bytes(self) -> bytes:
-        return _COOKIE.pack(Kind.COOKIE, VERSION, self.client_cid, self.nonce_half, self.cookie)
+        return _COOKIE.pack(Kind.COOKIE, VERSION, self.client_cid, self.nonce, self.cookie)
 
     @classmethod
     def parse(cls, data: bytes) -> Cookie:
         if len(data) != _COOKIE.size:
             raise Malformed("a COOKIE has another length")
-        _, version, cid, half, cookie = _COOKIE.unpack(data)
+        _, version, cid, nonce, cookie = _COOKIE.unpack(data)
         if version != VERSION:
             raise Malformed("another version")
-        return cls(cid, half, cookie)
+        return cls(cid, nonce, cookie)
 
 
 def _mode(version: int, mode: int) -> Mode:
@@ -244,7 +244,7 @@ class Assembly:
 # RESET and REFUSAL
 
 _RESET = struct.Struct(">BB8s16s")
-_REFUSAL = struct.Struct(">BB8s16sB")
+_REFUSAL = struct.Struct(">BB8s32sB")
 RESET_SIZE = _RESET.size
 
 
@@ -270,19 +270,19 @@ class Reason(IntEnum):
     FULL = 4
 
 
-def refusal_datagram(client_cid: bytes, nonce_half: bytes, reason: Reason) -> bytes:
-    """REFUSAL: kind, version, client's connection id (8), first half of N (16), reason (1)."""
-    return _REFUSAL.pack(Kind.REFUSAL, VERSION, client_cid, nonce_half, reason)
+def refusal_datagram(client_cid: bytes, nonce: bytes, reason: Reason) -> bytes:
+    """REFUSAL: kind, version, client's connection id (8), N (32), reason (1)."""
+    return _REFUSAL.pack(Kind.REFUSAL, VERSION, client_cid, nonce, reason)
 
 
 def parse_refusal(data: bytes) -> tuple[bytes, bytes, Reason]:
-    """(client's connection id, half nonce, reason) of a REFUSAL."""
+    """(client's connection id, N, reason) of a REFUSAL."""
     if len(data) != _REFUSAL.size or data[1] != VERSION:
         raise Malformed("a REFUSAL has another length or version")
-    _, _, cid, half, reason = _REFUSAL.unpack(data)
+    _, _, cid, nonce, reason = _REFUSAL.unpack(data)
     if reason not in Reason.__members__.values():
         raise Malformed("a reason that does not exist")
-    return cid, half, Reason(reason)
+    return cid, nonce, Reason(reason)
 
 
 # Bodies of PROOF and OFFER: fields, each behind its two-byte length

@@ -1,0 +1,75 @@
+"""One handshake by hand, message by message, so that a test can stand in between."""
+
+from __future__ import annotations
+
+from bridge.channel.world import SERVER_ADDRESS, make_client, make_server
+from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, Mode, Server, ServerConfig
+
+HERE = ("198.51.100.7", 50000)
+OPEN = {"source_rate": 1e6, "source_burst": 1e6}  # limits on handshakes are a test of their own
+
+
+class Steps:
+    def __init__(
+        self,
+        mode: Mode = Mode.EXCHANGE,
+        *,
+        server: Server | None = None,
+        client: Client | None = None,
+        now: float = 1000.0,
+    ) -> None:
+        self.now = now
+        self.server = server or make_server(now, ServerConfig(modes=(mode,), **OPEN))
+        self.client = client or make_client(now, ClientConfig(mode=mode))
+        self.client.connect(SERVER_ADDRESS, now)
+        [(self.hello, _)] = self.client.datagrams_to_send(now)
+
+    def to_server(self, *datagrams: bytes, source: tuple[str, int] = HERE) -> list[bytes]:
+        """Deliver, and what the server sends to anybody."""
+        for data in datagrams:
+            self.server.receive_datagram(data, source, self.now)
+        return [data for data, _ in self.server.datagrams_to_send(self.now)]
+
+    def to_client(self, *datagrams: bytes) -> list[bytes]:
+        for data in datagrams:
+            self.client.receive_datagram(data, SERVER_ADDRESS, self.now)
+        return [data for data, _ in self.client.datagrams_to_send(self.now)]
+
+    def until_cookie(self) -> bytes:
+        [self.cookie] = self.to_server(self.hello)
+        return self.cookie
+
+    def until_proof(self) -> list[bytes]:
+        self.proof = self.to_client(self.until_cookie())
+        return self.proof
+
+    def until_offer(self) -> list[bytes]:
+        self.offer = self.to_server(*self.until_proof())
+        return self.offer
+
+    def until_finished(self) -> bytes:
+        [self.finished] = self.to_client(*self.until_offer())
+        return self.finished
+
+    def until_connected(self) -> Steps:
+        self.accepted = self.to_server(self.until_finished())
+        self.to_client(*self.accepted)
+        assert any(isinstance(event, Connected) for event in events(self.client))
+        return self
+
+
+def events(end: Client | Server) -> list[Event]:
+    found = []
+    while (event := end.next_event()) is not None:
+        found.append(event)
+    return found
+
+
+def dropped(end: Client | Server) -> dict[str, int]:
+    return dict(end.statistics().dropped)
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
