@@ -1,0 +1,96 @@
+"""Coverage-guided fuzzing of everything that reads foreign bytes; needs the package `atheris`.
+
+Invariant, for every reader below and any bytes whatever:
+
+1. it returns a value or raises an SMCryptoError: no other exception, no hang;
+2. what it returned is written again as exactly the bytes that were read, where
+   the form has one encoding (DER containers, names, signatures of tags and lengths);
+3. text made of it contains nothing that does not print.
+
+    python fuzz/parsers.py -max_total_time=60 [CORPUS]
+
+Without atheris the same invariant is checked with random alterations of valid
+files by tests/smcrypto (test_der, test_keyfiles, test_certificates).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from smcrypto import SMCryptoError, der, pem, sm2, x509
+from smcrypto.x509 import Certificate, CertificateRevocationList, CertificateSigningRequest, Name
+
+
+def _require(holds: bool, what: str) -> None:
+    if not holds:
+        raise RuntimeError(f"invariant broken: {what}")
+
+
+def _der(data: bytes) -> None:
+    _require(der.check(data) == data, "DER")
+
+
+def _pem(data: bytes) -> None:
+    for label, content in pem.decode(data):
+        _require(pem.decode(pem.encode(label, content)) == [(label, content)], "PEM")
+
+
+def _private_key(data: bytes) -> None:
+    key = sm2.PrivateKey.from_der(data)
+    _require(sm2.PrivateKey.from_der(key.to_der()) == key, "private key")
+
+
+def _public_key(data: bytes) -> None:
+    key = sm2.PublicKey.from_der(data)
+    _require(sm2.PublicKey.from_der(key.to_der()) == key, "public key")
+
+
+def _name(data: bytes) -> None:
+    reader = der.Reader(data)
+    name = Name.read(reader)
+    reader.finish()
+    _require(Name(name.rdns).to_der() == data, "name")
+    _require(str(name).isprintable(), "name's text")
+
+
+def _certificate(data: bytes) -> None:
+    certificate = Certificate.from_der(data)
+    _require(certificate.to_der() == data, "certificate")
+    _require(repr(certificate).isprintable(), "certificate's text")
+    _require(all(name.isprintable() for name in certificate.subject_alt_names), "alternative names")
+    x509.verify_chain(certificate, roots=[certificate], at=certificate.not_before)
+
+
+def _request(data: bytes) -> None:
+    request = CertificateSigningRequest.from_der(data)
+    _require(request.to_der() == data and repr(request).isprintable(), "request")
+    request.verify()
+
+
+def _crl(data: bytes) -> None:
+    crl = CertificateRevocationList.from_der(data)
+    _require(crl.to_der() == data and repr(crl).isprintable(), "revocation list")
+
+
+READERS: tuple[Callable[[bytes], None], ...] = (
+    _der, _pem, _private_key, _public_key, _name, _certificate, _request, _crl,
+)  # fmt: skip
+
+
+def check(data: bytes) -> None:
+    """One input: its first byte chooses the reader."""
+    if not data:
+        return
+    try:
+        READERS[data[0] % len(READERS)](data[1:])
+    except SMCryptoError:
+        return
+
+
+if __name__ == "__main__":
+    import atheris
+
+    atheris.instrument_all()
+    atheris.Setup(sys.argv, check)
+    atheris.Fuzz()
