@@ -38,9 +38,6 @@ class Curve:
     def __hash__(self) -> int:
         return hash((self.p, self.n))
 
-    def __reduce__(self) -> tuple[type[Curve], tuple[str, int, int, int, int, Point, int]]:
-        return Curve, (self.name, self.p, self.a, self.b, self.n, self.G, self.h)
-
     @property
     def field_bytes(self) -> int:
         """Bytes of a field element, GB/T 32918.1, 4.2.6."""

@@ -10,7 +10,9 @@ import sm2_reference as reference
 from sm2_reference import TINY_61, TINY_1009
 from smcrypto import InvalidSignature, sm2
 from smcrypto.sm2 import SM2P256V1, encryption, exchange, signature
+from smcrypto.sm2 import known_keys as module
 from smcrypto.sm2.known_keys import KnownKeys, known_keys
+from smcrypto.sm2.points import Comb
 
 POINTS = [reference.multiple(k, TINY_1009.G, TINY_1009) for k in range(1, 40)]
 
@@ -21,7 +23,7 @@ def use(memory: KnownKeys, P, times: int, curve=TINY_1009) -> None:
 
 
 def test_a_key_earns_a_comb_by_being_used():
-    memory = KnownKeys(uses=2)
+    memory = KnownKeys(stages=((2, 3),))
     P = POINTS[0]
     assert memory.comb(TINY_1009, P) is None
     use(memory, P, 1)
@@ -36,14 +38,44 @@ def test_a_key_earns_a_comb_by_being_used():
     assert len(memory) == 1
 
 
+def test_a_key_used_much_earns_a_wider_comb():
+    memory = KnownKeys(stages=((2, 3), (5, 6)))
+    P = POINTS[3]
+    widths = []
+    for _ in range(8):
+        comb = memory.comb(TINY_1009, P)
+        widths.append(comb and comb.width)
+        use(memory, P, 1)
+    assert widths == [None, None, 3, 3, 3, 6, 6, 6]
+    assert len(memory) == 1
+
+
+def test_while_one_thread_builds_a_comb_the_others_go_on(monkeypatch):
+    memory = KnownKeys(stages=((1, 3), (2, 5)))
+    P = POINTS[0]
+    seen = []
+
+    def slow_comb(*arguments):
+        seen.append(memory.comb(TINY_1009, P))  # another thread asks while this one builds
+        return Comb(*arguments)
+
+    monkeypatch.setattr(module, "Comb", slow_comb)
+    use(memory, P, 1)
+    first = memory.comb(TINY_1009, P)
+    use(memory, P, 1)
+    second = memory.comb(TINY_1009, P)
+    assert (first.width, second.width) == (3, 5)
+    assert seen == [None, first]
+
+
 def test_the_same_point_of_another_curve_is_another_key():
-    memory = KnownKeys(uses=1)
+    memory = KnownKeys(stages=((1, 3),))
     use(memory, TINY_1009.G, 1)
     assert memory.comb(TINY_61, TINY_1009.G) is None
 
 
 def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
-    memory = KnownKeys(combs=3, uses=1)
+    memory = KnownKeys(stages=((1, 3),), combs=3)
     for P in POINTS[:3]:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
@@ -60,16 +92,16 @@ def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
 
 
 def test_the_number_of_candidates_is_bounded():
-    memory = KnownKeys(candidates=5, uses=2)
+    memory = KnownKeys(stages=((2, 3),), candidates=5)
     for _ in range(3):
         for P in POINTS[:10]:  # each forgotten before it comes round again
             use(memory, P, 1)
             assert memory.comb(TINY_1009, P) is None
-    assert len(memory._counts) == 5
+    assert len(memory._candidates) == 5
 
 
 def test_only_signatures_that_hold_count(monkeypatch):
-    memory = KnownKeys(uses=1)
+    memory = KnownKeys(stages=((1, 3),))
     monkeypatch.setattr(signature, "known_keys", memory)
     key = sm2.PrivateKey.generate()
     signed = key.sign(b"message")
@@ -82,14 +114,14 @@ def test_only_signatures_that_hold_count(monkeypatch):
 
 
 def test_results_are_the_same_before_and_after_a_key_is_known(monkeypatch):
-    memory = KnownKeys(uses=3)
-    for module in (signature, encryption, exchange):
-        monkeypatch.setattr(module, "known_keys", memory)
+    memory = KnownKeys(stages=((3, 4), (8, 6)))
+    for user in (signature, encryption, exchange):
+        monkeypatch.setattr(user, "known_keys", memory)
     key, peer = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
     signed = key.sign(b"message")
     r = sm2.PrivateKey.from_int(77)
     outcomes = set()
-    for _ in range(6):
+    for _ in range(10):
         key.public_key.verify(signed, b"message")
         with pytest.raises(InvalidSignature):
             key.public_key.verify(signed, b"massage")
@@ -101,7 +133,7 @@ def test_results_are_the_same_before_and_after_a_key_is_known(monkeypatch):
 
 
 def test_several_threads_share_the_memory():
-    memory = KnownKeys(combs=4, uses=2)
+    memory = KnownKeys(stages=((2, 3), (20, 5)), combs=4)
 
     def work(i: int) -> None:
         P = POINTS[i % 6]
