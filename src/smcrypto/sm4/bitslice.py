@@ -134,18 +134,23 @@ def _alternating(width: int) -> tuple[int, ...]:
     return tuple(masks)
 
 
-def transpose(rows: Sequence[int], width: int) -> list[int]:
-    """Planes from rows, or rows from planes: an involution.
+def transpose(rows: list[int], width: int) -> None:
+    """Rows become planes, or planes rows, in place: it is its own inverse.
 
     Bit p of (row r << r) is bit p of (plane i << i) where i = p - r mod 128. So
     after shifting, bits only move between integers, never within one: by the
     distance p mod 128, which 7 masked steps of 1, 2, 4 ... 64 add up to.
     """
-    skewed = [rows[-r % 128] << (-r % 128) for r in range(128)]
+    rows[:] = [rows[-r % 128] << (-r % 128) for r in range(128)]
     for s, mask in enumerate(_alternating(width)):
         step = 1 << s
-        skewed = [a ^ ((a ^ b) & mask) for a, b in zip(skewed, skewed[-step:] + skewed[:-step], strict=True)]
-    return list(map(rshift, skewed, range(128)))
+        wrapped = rows[-step:] + rows  # entry r is row r - step as it was
+        del wrapped[128:]
+        while wrapped:
+            r = len(wrapped) - 1
+            row = rows[r]
+            rows[r] = row ^ (row ^ wrapped.pop()) & mask
+    rows[:] = map(rshift, rows, range(128))
 
 
 # ---------------------------------------------------------------- the cipher
@@ -180,20 +185,20 @@ def _tau_then_L(t: list[int]) -> Iterator[int]:
 _WORDS = [[8 * (4 * w + 3 - b // 8) + b % 8 for b in range(32)] for w in range(4)]
 
 
-def crypt_planes(planes: Sequence[int], keys: Sequence[list[int]], width: int) -> list[int]:
-    """The 32 rounds on all lanes: planes to planes."""
+def crypt_planes(planes: list[int], keys: Sequence[list[int]], width: int) -> None:
+    """The 32 rounds on all lanes, in place."""
     a, b, c, d = ([planes[i] for i in word] for word in _WORDS)
+    planes.clear()
     for i in range(0, 32, 2):
         shared = list(map(xor, c, d))  # X_(i+2) ^ X_(i+3) enters this round and the next
         a = list(map(xor, a, _tau_then_L(list(map(xor, map(xor, shared, b), keys[i])))))
         b = list(map(xor, b, _tau_then_L(list(map(xor, map(xor, shared, a), keys[i + 1])))))
         a, b, c, d = c, d, a, b
     lanes = (1 << 128 * width) - 1
-    out = [0] * 128
+    planes += [0] * 128
     for word, bits in zip(_WORDS, (d, c, b, a), strict=True):
         for i, plane in zip(word, bits, strict=True):
-            out[i] = plane & lanes
-    return out
+            planes[i] = plane & lanes
 
 
 @lru_cache(maxsize=8)
@@ -233,17 +238,24 @@ def counter_planes(first: int, width: int, counter_bits: int = 128) -> list[int]
 
 # ---------------------------------------------------------------- on bytes
 
+def _finish(planes: list[int], keys: Sequence[list[int]], width: int, mask: bytes | None, length: int) -> bytes:
+    """The cipher on `planes`, back to bytes, XOR `mask`, cut to `length`."""
+    crypt_planes(planes, keys, width)
+    transpose(planes, width)
+    size = 16 * width
+    if mask is not None:
+        for r in range(128):
+            planes[r] ^= int.from_bytes(mask[r * size : (r + 1) * size], "little")
+    return b"".join([row.to_bytes(size, "little") for row in planes])[:length]
+
+
 def crypt_xor(keys: Sequence[list[int]], blocks: bytes, mask: bytes | None, width: int) -> bytes:
     """The cipher on up to 128 * `width` blocks, XOR `mask` of the same length; keys: `key_planes` for this width."""
-    planes = transpose(rows_from_bytes(blocks, width), width)
-    rows = transpose(crypt_planes(planes, keys, width), width)
-    if mask is not None:
-        rows = list(map(xor, rows, rows_from_bytes(mask, width)))
-    return rows_to_bytes(rows, width)[: len(blocks)]
+    planes = rows_from_bytes(blocks, width)
+    transpose(planes, width)
+    return _finish(planes, keys, width, mask, len(blocks))
 
 
 def ctr_xor(keys: Sequence[list[int]], first: int, data: bytes, width: int, counter_bits: int) -> bytes:
     """Up to 2048 * `width` bytes of data XOR the encryptions of `first`, `first` + 1, ..."""
-    planes = crypt_planes(counter_planes(first, width, counter_bits), keys, width)
-    rows = list(map(xor, transpose(planes, width), rows_from_bytes(data, width)))
-    return rows_to_bytes(rows, width)[: len(data)]
+    return _finish(counter_planes(first, width, counter_bits), keys, width, data, len(data))

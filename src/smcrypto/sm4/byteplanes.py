@@ -24,6 +24,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from itertools import repeat
+from operator import mul
 
 from smcrypto.sm4.block import SBOX
 
@@ -51,12 +53,12 @@ def words_to_bytes(words: Sequence[int], n: int) -> bytes:
 def key_words(rk: Sequence[int], n: int) -> list[int]:
     """The round keys, each byte n times."""
     key_bytes = struct.pack(">32I", *rk)
-    if n <= 64:  # n slice assignments for all keys, rather than 4 repetitions for each
+    if n <= 24:  # n assignments of all bytes, rather than 128 repetitions
         runs = bytearray(128 * n)
         for i in range(n):
             runs[i::n] = key_bytes
     else:
-        runs = bytearray().join([bytes((byte,)) * n for byte in key_bytes])
+        runs = bytearray().join(map(mul, struct.unpack("128c", key_bytes), repeat(n)))
     return list(map(int.from_bytes, struct.unpack(f"{4 * n}s" * 32, runs)))
 
 

@@ -35,7 +35,7 @@ class SM4:
 
     def encrypt_block(self, block: BytesLike) -> bytes:
         """The 16-byte ciphertext of a 16-byte block; another length is InvalidLength."""
-        self._blocks += 1
+        self._blocks += 1  # a key that is used a lot gets the wide tables
         return crypt_block(self._encrypt_keys, as_exact_bytes(block, "block", 16), self._blocks)
 
     def decrypt_block(self, block: BytesLike) -> bytes:

@@ -13,7 +13,7 @@ from smcrypto.sm4 import bitslice, byteplanes, tables
 
 __all__ = ["Engine", "counter_blocks", "xor_bytes"]
 
-FEW_BLOCKS = 2  # up to here: one by one
+FEW_BLOCKS = 3  # up to here: one by one
 BULK_BLOCKS = 3072  # from here: bit slices
 _PLANE_BLOCKS = 1024  # at most so many at once as byte planes: more leave the cache
 

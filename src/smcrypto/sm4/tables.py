@@ -112,8 +112,8 @@ def expand_key(key: bytes) -> tuple[int, ...]:
 
 
 def _kind(blocks: int) -> tuple[dict[str, Callable[..., Any]], Tables]:
-    """The wide tables if they exist or `blocks` are enough to pay for them."""
-    return _wide() if blocks >= WIDE_BLOCKS or _wide.cache_info().currsize else _narrow()
+    """The wide tables where `blocks` are enough to pay for them."""
+    return _wide() if blocks >= WIDE_BLOCKS else _narrow()
 
 
 def crypt_block(rk: Sequence[int], block: bytes, blocks: int = 1) -> bytes:
