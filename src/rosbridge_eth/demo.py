@@ -18,7 +18,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rosbridge_eth import ledger
 from rosbridge_eth.bundle import open_bundle
 from rosbridge_eth.capture import CapturedRecord
 from rosbridge_eth.channel.udp import server_sockets
@@ -27,9 +26,11 @@ from rosbridge_eth.errors import BridgeError
 from rosbridge_eth.home import OperatorHome, RobotHome
 from rosbridge_eth.identity import load_identity
 from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.ledger.embedded import EmbeddedChain
 from rosbridge_eth.ledger.submitter import BatchTiming
 from rosbridge_eth.reader import Choice, Reading, ReadRecord, read_robot
 from rosbridge_eth.registry import Registry
+from rosbridge_eth.relay import Harm, Relay
 from rosbridge_eth.robot import assembly as robot_assembly
 from rosbridge_eth.robot.process import Robot
 from rosbridge_eth.server.administration import (
@@ -133,10 +134,15 @@ def run_demo(
     bag: Path,
     *,
     topics: Sequence[str] = (f"/{ROBOT}/odom",),
+    harm: Harm | None = None,
+    on_datagram: Callable[[bytes], None] = lambda data: None,
     on_stage: Callable[[str], None] = lambda text: None,
     on_progress: Callable[[Stages], None] = lambda stages: None,
 ) -> DemoResult:
-    """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards."""
+    """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
+
+    harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each of them.
+    """
     started = time.monotonic()
     stages = Stages()
     home, robot_home = OperatorHome(folder / "operator"), RobotHome(folder / "robot")
@@ -150,7 +156,7 @@ def run_demo(
 
     on_stage("starting the embedded chain, deploying the contract")
     with _timed(stages, "chain and contract"):
-        chain = ledger.embedded(fund={keys.operator.address: FUNDS})
+        chain = EmbeddedChain(fund={keys.operator.address: FUNDS})
         deployment = deploy_contract(home, chain, keys)
         contract = bound_contract(chain, deployment)
 
@@ -175,7 +181,8 @@ def run_demo(
             keys=keys,
         ),
     )
-    robot_home.config.write_text(robot_toml(topics, bag, sock.getsockname()[1]))
+    relay = Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)
+    robot_home.config.write_text(robot_toml(topics, bag, relay.port))
     robot = robot_assembly.open_robot(robot_home, load_robot_config(robot_home.config), password)
 
     on_stage("replaying the bag over UDP")
@@ -188,6 +195,7 @@ def run_demo(
             _settle(server, stages, on_progress)
     finally:
         server.end()
+        relay.close()
     server.check()
     _costs(robot, server, stages)
 

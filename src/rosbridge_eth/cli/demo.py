@@ -23,6 +23,9 @@ def demo(
     report: Annotated[Path, typer.Option(help="Folder for the report; made if absent.")] = Path("demo-report"),
     bag: Annotated[Path | None, typer.Option(help="A bag of your own; without it, the sample.")] = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
+    loss: Annotated[
+        float, typer.Option(min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")
+    ] = 0.0,
     json: Json = False,
 ) -> None:
     """Replay a real bag over real UDP onto an Ethereum chain in this process, read it back, prove and compare it.
@@ -31,6 +34,7 @@ def demo(
     """
     from rosbridge_eth.demo import ROBOT, Stages, run_demo
     from rosbridge_eth.reading import outputs
+    from rosbridge_eth.relay import Harm
     from rosbridge_eth.sources.sample import sample_bag
 
     log_to_stderr(verbose=False)
@@ -46,7 +50,7 @@ def demo(
                 progress.update(bar, completed=getattr(stages, name))
 
         result = run_demo(
-            Path(home), chosen, topics=topics, on_stage=lambda text: progress.console.print(f"· {text}"),
+            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2), on_stage=lambda text: progress.console.print(f"· {text}"),
             on_progress=show,
         )
     stages = result.stages

@@ -1,0 +1,81 @@
+"""The main job: every record of the sample bag through UDP onto the EVM and back, and what the demo says if not."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rosbridge_eth.capture import CapturedRecord
+from rosbridge_eth.demo import DemoResult, compare, run_demo
+from rosbridge_eth.sources.sample import sample_bag
+
+ROOT = Path(__file__).resolve().parents[2]
+TOPIC = "/robot_1/odom"
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
+    return run_demo(tmp_path_factory.mktemp("demo"), sample_bag())
+
+
+def captured(result: DemoResult) -> list[CapturedRecord]:
+    return [record.captured for record in result.records]
+
+
+def test_every_record_of_the_bag_comes_back_proven(result: DemoResult) -> None:
+    assert result.passed
+    assert result.stages.captured == result.stages.verified == 300
+    assert result.reading.complete
+    assert not result.comparison.differences
+
+
+def test_a_record_costs_less_than_the_issue_allows_in_gas(result: DemoResult) -> None:
+    full = [batch for batch in result.batches if batch.records == 100]
+    assert full
+    assert all(batch.gas_used <= 15_000 * batch.records for batch in full)
+
+
+def test_a_missing_record_is_told(result: DemoResult) -> None:
+    comparison = compare(sample_bag(), [TOPIC], captured(result)[:-1])
+    assert any("299 came back" in difference for difference in comparison.differences)
+
+
+def test_a_doubled_record_is_told(result: DemoResult) -> None:
+    records = captured(result)
+    comparison = compare(sample_bag(), [TOPIC], [*records, records[-1]])
+    assert any("301 came back" in difference for difference in comparison.differences)
+
+
+def test_an_altered_field_is_told_by_its_path(result: DemoResult) -> None:
+    records = captured(result)
+    data = json.loads(json.dumps(records[7].data))
+    data["pose"]["pose"]["position"]["x"] += 1e-9
+    records[7] = replace(records[7], data=data, data_json=None)
+    comparison = compare(sample_bag(), [TOPIC], records)
+    assert comparison.equal == 299
+    assert "pose.pose.position.x" in comparison.differences[0]
+
+
+def test_an_incomplete_result_does_not_pass(result: DemoResult) -> None:
+    assert not replace(result, records=result.records[:-1]).passed
+
+
+@pytest.mark.slow
+def test_the_command_leaves_a_report_and_prints_json(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    done = subprocess.run(
+        [sys.executable, "-m", "rosbridge_eth", "demo", "--json", "--report", str(tmp_path / "report")],
+        capture_output=True, env=environment, cwd=tmp_path, check=False, timeout=120,
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    report = json.loads(done.stdout)
+    assert report["passed"] and report["counts"]["verified"] == 300
+    assert (tmp_path / "report" / "trajectory.png").read_bytes().startswith(b"\x89PNG")
+    assert len((tmp_path / "report" / "records.jsonl").read_text().splitlines()) == 300
+    assert "Every record came back" in (tmp_path / "report" / "report.html").read_text()
