@@ -1,0 +1,258 @@
+"""The recorded handshakes, computed again from docs/channel.md and the standards with nothing of this project.
+
+Textbook arithmetic on affine points of the SM2 curve, SM3 of the standard
+library's OpenSSL, SM4 of `cryptography` under a textbook GHASH, and slices of
+the datagrams by the figures of the documentation. Then the project's own
+functions are held against the same values.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rosbridge_eth.channel.protection import Direction, SessionSecrets
+from rosbridge_eth.channel.wire import Mode
+from rosbridge_eth.identity import Role
+from smcrypto import sm2
+
+FILE = Path(__file__).parents[2] / "vectors" / "channel" / "transcripts.json"
+TEXT = {"source", "mode", "client_address", "server_address"}
+
+try:
+    hashlib.new("sm3")
+except ValueError:
+    pytest.skip("this Python's OpenSSL has no SM3", allow_module_level=True)
+
+
+def unhexed(key, value):
+    if key in TEXT:
+        return value
+    return [bytes.fromhex(v) for v in value] if isinstance(value, list) else bytes.fromhex(value)
+
+
+CASES = [SimpleNamespace(**{k: unhexed(k, v) for k, v in c.items()}) for c in json.loads(FILE.read_text())["tests"]]
+case = pytest.mark.parametrize("v", CASES, ids=lambda v: v.mode)
+
+# GB/T 32918.5-2017, the recommended curve
+P = 0xFFFFFFFEFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFFF00000000FFFFFFFFFFFFFFFF
+A = P - 3
+B = 0x28E9FA9E9D9F5E344D5A9E4BCF6509A7F39789F515AB8F92DDBCBD414D940E93
+N = 0xFFFFFFFEFFFFFFFFFFFFFFFFFFFFFFFF7203DF6B21C6052B53BBF40939D54123
+G = (
+    0x32C4AE2C1F1981195F9904466A39C9948FE30BBFF2660BE1715A4589334C74C7,
+    0xBC3736A2F4F6779C59BDCEE36B692153D0A9877CC62A474002DF32E52139F0A0,
+)
+
+
+def sm3(*data: bytes) -> bytes:
+    return hashlib.new("sm3", b"".join(data)).digest()
+
+
+def add(p, q):
+    if p is None or q is None:
+        return p or q
+    if p[0] == q[0]:
+        if (p[1] + q[1]) % P == 0:
+            return None
+        slope = (3 * p[0] * p[0] + A) * pow(2 * p[1], -1, P) % P
+    else:
+        slope = (q[1] - p[1]) * pow(q[0] - p[0], -1, P) % P
+    x = (slope * slope - p[0] - q[0]) % P
+    return x, (slope * (p[0] - x) - p[1]) % P
+
+
+def times(k, p):
+    result = None
+    for bit in bin(k)[2:]:
+        result = add(result, result)
+        if bit == "1":
+            result = add(result, p)
+    return result
+
+
+def point(data: bytes):
+    assert data[0] == 4 and len(data) == 65
+    return int.from_bytes(data[1:33], "big"), int.from_bytes(data[33:], "big")
+
+
+def b32(n: int) -> bytes:
+    return n.to_bytes(32, "big")
+
+
+def z(identity: bytes, public) -> bytes:
+    curve = b"".join(map(b32, (A, B, *G, *public)))
+    return sm3((len(identity) * 8).to_bytes(2, "big"), identity, curve)
+
+
+def check_signature(public, message: bytes, signature: bytes) -> None:
+    r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
+    assert 0 < r < N and 0 < s < N
+    e = int.from_bytes(sm3(z(b"1234567812345678", public), message), "big")
+    x1, _ = add(times(s, G), times((r + s) % N, public))
+    assert (e + x1) % N == r
+
+
+def kdf(data: bytes, length: int) -> bytes:
+    blocks = range(1, -(-length // 32) + 1)
+    return b"".join(sm3(data, i.to_bytes(4, "big")) for i in blocks)[:length]
+
+
+def mac(key: bytes, data: bytes) -> bytes:
+    return hmac.new(key, data, "sm3").digest()
+
+
+def hkdf(key: bytes, length: int, salt: bytes, info: bytes) -> bytes:
+    prk, block, out = mac(salt or bytes(32), key), b"", b""
+    while len(out) < length:
+        block = mac(prk, block + info + bytes((len(out) // 32 + 1,)))
+        out += block
+    return out[:length]
+
+
+def gcm_open(key: bytes, nonce: bytes, data: bytes, header: bytes) -> bytes:
+    ciphers = pytest.importorskip("cryptography.hazmat.primitives.ciphers")
+    from cryptography.hazmat.decrepit.ciphers import algorithms as older
+    from cryptography.hazmat.primitives.ciphers import algorithms, modes
+
+    algorithm = getattr(algorithms, "SM4", None) or older.SM4
+    encryptor = ciphers.Cipher(algorithm(key), modes.ECB()).encryptor()
+    h = int.from_bytes(encryptor.update(bytes(16)), "big")
+
+    def multiply(x: int) -> int:
+        product, v = 0, h
+        for bit in range(127, -1, -1):
+            if x >> bit & 1:
+                product ^= v
+            v = v >> 1 ^ (0xE1 << 120 if v & 1 else 0)
+        return product
+
+    text, tag = data[:-16], data[-16:]
+    lengths = (len(header) * 8).to_bytes(8, "big") + (len(text) * 8).to_bytes(8, "big")
+    y = 0
+    for part in (header + bytes(-len(header) % 16), text + bytes(-len(text) % 16), lengths):
+        for i in range(0, len(part), 16):
+            y = multiply(y ^ int.from_bytes(part[i : i + 16], "big"))
+    first = int.from_bytes(encryptor.update(nonce + b"\0\0\0\1"), "big")
+    assert b32(first ^ y)[16:] == tag
+    stream = b"".join(
+        encryptor.update(nonce + (2 + i).to_bytes(4, "big")) for i in range(-(-len(text) // 16))
+    )
+    return bytes(a ^ b for a, b in zip(text, stream, strict=False))
+
+
+def packet(secret: bytes, data: bytes) -> bytes:
+    keys = hkdf(secret, 60, b"", b"rosbridge-eth/1 packets")
+    number = int.from_bytes(data[9:15], "big")
+    nonce = (int.from_bytes(keys[16:28], "big") ^ number).to_bytes(12, "big")
+    return gcm_open(keys[:16], nonce, data[15:], data[:15])
+
+
+def split(body: bytes) -> list[bytes]:
+    found = []
+    while body:
+        length = int.from_bytes(body[:2], "big")
+        found.append(body[2 : 2 + length])
+        body = body[2 + length :]
+    return found
+
+
+def joined(*parts: bytes) -> bytes:
+    return b"".join(len(part).to_bytes(2, "big") + part for part in parts)
+
+
+def shared_secret(v, client_id: bytes, server_id: bytes, r_a: bytes, r_b: bytes):
+    """GB/T 32918.3-2016, 6.1, from A's side: K, S_B, S_A."""
+    d_a, r = int.from_bytes(v.client_encryption_key, "big"), int.from_bytes(v.client_ephemeral_key, "big")
+    p_a, p_b = times(d_a, G), times(int.from_bytes(v.server_encryption_key, "big"), G)
+    ra, rb = point(r_a), point(r_b)
+    assert times(r, G) == ra
+    assert times(int.from_bytes(v.server_ephemeral_key, "big"), G) == rb
+    w = 2**127
+    x1, x2 = w + (ra[0] & (w - 1)), w + (rb[0] & (w - 1))
+    u = times((d_a + x1 * r) % N, add(p_b, times(x2, rb)))
+    z_a, z_b = z(client_id, p_a), z(server_id, p_b)
+    k = kdf(b32(u[0]) + b32(u[1]) + z_a + z_b, 32)
+    inner = sm3(b32(u[0]), z_a, z_b, b32(ra[0]), b32(ra[1]), b32(rb[0]), b32(rb[1]))
+    return k, sm3(b"\x02", b32(u[1]), inner), sm3(b"\x03", b32(u[1]), inner)
+
+
+@case
+def test_the_transcript_follows_from_the_documents(v):
+    mode = {"exchange": 1, "transport": 2}[v.mode]
+    assert v.hello[:3] == bytes((1, 1, mode)) and len(v.hello) == 1200 and not any(v.hello[43:])
+    client_cid, nonce = v.hello[3:11], v.hello[11:43]
+    assert v.cookie[:42] == b"\x02\x01" + client_cid + nonce
+    cookie = v.cookie[42:]
+    for index, data in enumerate(v.proof):
+        assert data[:69] == b"\x03" + v.hello[1:43] + cookie + bytes((index, len(v.proof)))
+    for index, data in enumerate(v.offer):
+        assert data[:12] == b"\x04\x01" + client_cid + bytes((index, len(v.offer)))
+    proof = split(b"".join(data[69:] for data in v.proof))
+    offer = split(b"".join(data[12:] for data in v.offer))
+    assert (len(proof), len(offer)) == (4, 8)
+    client_sign, client_enc, r_a, client_signature = proof
+    server_nonce, server_cid, server_sign, server_enc, material, server_signature, s_b, server_finished = offer
+    assert len(server_nonce) == 32 and server_cid[0] == 0
+    assert v.client_signing_public in client_sign and v.server_signing_public in server_sign
+
+    so_far = b"rosbridge-eth/1 handshake\0" + bytes((1, mode)) + client_cid + nonce + cookie
+    so_far += joined(client_sign, client_enc, r_a)
+    purpose = b"rosbridge-eth/1 handshake\0"
+    check_signature(point(v.client_signing_public), purpose + b"client" + sm3(so_far), client_signature)
+    so_far += joined(client_signature, server_nonce, server_cid, server_sign, server_enc, material)
+    check_signature(point(v.server_signing_public), purpose + b"server" + sm3(so_far), server_signature)
+    so_far += joined(server_signature, s_b)
+    h3 = sm3(so_far)
+    assert h3 == v.h3
+
+    s_a = bytes(32)
+    if v.mode == "exchange":
+        k, expected_s_b, s_a = shared_secret(
+            v, b"robot" + sm3(client_enc), b"server" + sm3(server_enc), r_a, material
+        )
+        assert k == v.shared and s_b == expected_s_b
+    else:
+        assert r_a == b"" and s_b == b""
+        assert sm2.PrivateKey.from_bytes(v.client_encryption_key).decrypt(material) == v.shared
+
+    secrets = hkdf(v.shared, 128, h3, b"rosbridge-eth/1 session " + v.mode.encode())
+    client, server, client_finished, server_finish = (secrets[i : i + 32] for i in range(0, 128, 32))
+    assert (client, server) == (v.client_secret, v.server_secret)
+    assert server_finished == mac(server_finish, h3)
+    h4 = sm3(so_far + joined(server_finished))
+    assert v.finished[:15] == b"\x40" + server_cid + bytes(6)
+    assert packet(client, v.finished)[:65] == b"\x0a" + s_a + mac(client_finished, h4)
+    [accepted] = v.accepted
+    frames = packet(server, accepted)
+    assert accepted[1:9] == client_cid and b"\x0b" in frames
+    message = packet(client, v.message)
+    assert message.endswith(b"\x03" + bytes(4) + len(v.message_payload).to_bytes(2, "big") + v.message_payload)
+
+
+@case
+def test_our_functions_give_the_recorded_values(v):
+    from rosbridge_eth.channel.handshake import exchange_id
+
+    secrets = SessionSecrets(v.shared, v.h3, Mode[v.mode.upper()])
+    assert (secrets.client, secrets.server) == (v.client_secret, v.server_secret)
+    assert Direction(v.client_secret).open(v.finished, 0)[0] == 0x0A
+    number = int.from_bytes(v.message[9:15], "big")
+    assert Direction(v.client_secret).open(v.message, number).endswith(v.message_payload)
+    if v.mode == "exchange":
+        proof = split(b"".join(data[69:] for data in v.proof))
+        offer = split(b"".join(data[12:] for data in v.offer))
+        exchange = sm2.KeyExchange(
+            sm2.PrivateKey.from_bytes(v.server_encryption_key),
+            exchange_id(Role.SERVER, offer[3]),
+            sm2.PrivateKey.from_bytes(v.client_encryption_key).public_key,
+            exchange_id(Role.ROBOT, proof[1]),
+            initiator=False,
+            ephemeral_key=sm2.PrivateKey.from_bytes(v.server_ephemeral_key),
+        )
+        assert exchange.agree(proof[2], 32) == (v.shared, offer[6])
