@@ -40,7 +40,23 @@ _TYPES: Final = (
     ("emailAddress", "1.2.840.113549.1.9.1", 255, der.IA5_STRING),
 )
 _BY_OID: Final = {oid: name for name, oid, _, _ in _TYPES}
-_BY_NAME: Final = {name.lower(): (oid, bound, tag) for name, oid, bound, tag in _TYPES}
+# The long names of X.520 and RFC 4519, understood where a type is given, never printed.
+_LONG: Final = {
+    "commonname": "CN",
+    "surname": "SN",
+    "countryname": "C",
+    "localityname": "L",
+    "stateorprovincename": "ST",
+    "streetaddress": "STREET",
+    "organizationname": "O",
+    "organizationalunitname": "OU",
+    "givenname": "GN",
+    "userid": "UID",
+    "domaincomponent": "DC",
+}
+_SHORT: Final = {name.lower(): (oid, bound, tag) for name, oid, bound, tag in _TYPES}
+_BY_NAME: Final = _SHORT | {long: _SHORT[short.lower()] for long, short in _LONG.items()}
+_COUNTRY: Final = "2.5.4.6"
 _PRINTABLE: Final = re.compile(r"[A-Za-z0-9 '()+,\-./:=?]*")  # X.680, 41.4
 # PrintableString is read more widely than X.680 allows, because CAs write "*", "@", "_" and "&" into it.
 _CODECS: Final = {
@@ -204,8 +220,8 @@ def _attribute(kind: str, text: str) -> Attribute:
         der.oid(oid)
     except InvalidEncoding:
         raise InvalidOption(f"unknown attribute type {kind!r}; a dotted object identifier names any other") from None
-    if not 1 <= len(text) <= bound or (kind.upper() == "C" and len(text) != 2):
-        limits = "exactly 2" if kind.upper() == "C" else f"1 to {bound}"
+    if not 1 <= len(text) <= bound or (oid == _COUNTRY and len(text) != 2):
+        limits = "exactly 2" if oid == _COUNTRY else f"1 to {bound}"
         raise InvalidOption(f"a name's {kind} must have {limits} characters, not {len(text)}")
     if tag == der.PRINTABLE_STRING and not _PRINTABLE.fullmatch(text):
         raise InvalidOption(f"a name's {kind} takes letters, digits, blank and '()+,-./:=? only")

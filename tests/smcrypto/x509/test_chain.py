@@ -365,6 +365,7 @@ def test_a_leaf_for_any_purpose_or_without_the_extension() -> None:
 def test_key_usage_of_the_leaf() -> None:
     encryption = SUB.issue("encryption", key_usage=x509.ENCRYPTION_KEY_USAGE)
     assert verify(encryption, SUB, key_usage=("keyAgreement", "keyEncipherment"))
+    assert verify(encryption, SUB, key_usage=x509.ENCRYPTION_KEY_USAGE)
     refused("CN=encryption may not be used for digitalSignature", encryption, SUB, key_usage="digitalSignature")
     refused("may not be used for keyAgreement", LEAF, SUB, key_usage=["digitalSignature", "keyAgreement"])
     assert verify(LEAF, SUB, key_usage="contentCommitment")
@@ -426,6 +427,14 @@ def test_a_pile_of_intermediates_is_searched_within_bounds() -> None:
         layers.append(layer[:: len(keys)])
         pile += layer
     refused("no path was found", layers[-1][0].issue("leaf"), *pile)
+
+
+def test_a_thousand_candidates_are_looked_at_and_no_more() -> None:
+    """Decoys of the right name and the wrong key identifier cost a step each; the root is the last step."""
+    key = sm2.PrivateKey.generate()
+    decoys = [ROOT.ca("sub", key=key, serial_number=i + 1) for i in range(999)]
+    assert len(verify(LEAF, *decoys[:998], SUB)) == 3
+    refused("no path was found in 1000 steps", LEAF, *decoys, SUB)
 
 
 def test_a_large_trust_store_is_no_pile() -> None:

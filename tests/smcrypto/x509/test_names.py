@@ -137,6 +137,17 @@ def test_a_name_from_each_form() -> None:
     assert name != "CN=robot_1,O=Fleet,C=CN"
 
 
+def test_long_names_of_types_are_understood() -> None:
+    name = Name.build({"countryName": "CN", "organizationName": "Fleet", "commonName": "robot_1"})
+    assert name == Name.build({"C": "CN", "O": "Fleet", "CN": "robot_1"}) and name.get("commonName") == "robot_1"
+    with pytest.raises(InvalidOption, match="exactly 2"):
+        Name.build({"countryName": "C"})
+
+
+def test_a_dotted_type_keeps_to_no_bound_but_its_own() -> None:
+    assert Name.build({"2.5.4.3": "x" * 65}).get("CN") == "x" * 65  # as CAs out there have it
+
+
 def test_string_types_are_those_of_rfc_5280() -> None:
     name = Name.build({"C": "CN", "CN": "a", "DC": "a", "emailAddress": "a@b", "serialNumber": "7", "2.5.4.99": "x"})
     tags = [a.value[0] for a in name.attributes]
