@@ -53,6 +53,8 @@ TINY_61 = _tiny(67, 2, 18, (1, 17), 61)
 TINY_79 = _tiny(67, -3, 36, (0, 6), 79)
 TINY_1009 = _tiny(1031, -3, 63, (2, 257), 1009)
 TINY = (TINY_17, TINY_61, TINY_79, TINY_1009)
+# A cofactor that is not 1: 76 = 4 * 19 points.
+COFACTOR_4 = _tiny(67, -3, 17, (2, 32), 19, 4)
 
 _sample = {
     name: int(value, 16) if isinstance(value, str) and name != "name" else value

@@ -11,17 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sm2_reference as reference
-from sm2_reference import CURVES, SAMPLE, TINY, TINY_17, TINY_61, TINY_79
+from sm2_reference import COFACTOR_4, CURVES, SAMPLE, TINY, TINY_17, TINY_61, TINY_79
 from smcrypto import InvalidKey
-from smcrypto.sm2 import SM2P256V1, Curve, PrivateKey, PublicKey
+from smcrypto.sm2 import SM2P256V1, PrivateKey, PublicKey
 from smcrypto.sm2.curve import decode_point, encode_point, plain_add, plain_multiple, require_point, square_root
 from vectors_json import STANDARDS, load
 
-# y^2 = x^3 - 3x + 17 over F_67 has 76 = 4 * 19 points.
-COFACTOR_4 = Curve("cofactor 4", 67, 64, 17, 19, (0, 0), 4)
 
-
-@pytest.mark.parametrize("curve", [SM2P256V1, SAMPLE, *TINY], ids=lambda c: c.name)
+@pytest.mark.parametrize("curve", [SM2P256V1, SAMPLE, *TINY, COFACTOR_4], ids=lambda c: c.name)
 def test_the_base_point_is_on_the_curve_and_of_prime_order(curve):
     assert curve.holds(curve.G)
     assert pow(2, curve.n - 1, curve.n) == 1
@@ -29,7 +26,7 @@ def test_the_base_point_is_on_the_curve_and_of_prime_order(curve):
     assert (4 * curve.a**3 + 27 * curve.b**2) % curve.p != 0
 
 
-@pytest.mark.parametrize("curve", TINY, ids=lambda c: c.name)
+@pytest.mark.parametrize("curve", [*TINY, COFACTOR_4], ids=lambda c: c.name)
 def test_a_tiny_curve_has_as_many_points_as_it_says(curve):
     assert len(reference.points(curve)) + 1 == curve.n * curve.h
 

@@ -117,6 +117,15 @@ def test_der_has_no_second_form():
             KEY.decrypt(bad)
 
 
+@pytest.mark.parametrize("length", [0, 31, 33])
+def test_a_c3_of_another_length_is_no_ciphertext_at_all(length):
+    x, y = (der.integer(v) for v in SM2P256V1.G)
+    with pytest.raises(InvalidCiphertext):
+        encryption.decode_ciphertext(
+            der.sequence(x, y, der.octet_string(bytes(length)), der.octet_string(b"")), SM2P256V1, "der"
+        )
+
+
 def zero_stream_nonces(curve, P):
     """The nonces whose one-byte key stream is 00."""
     size = curve.field_bytes
