@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import shutil
 import sqlite3
 import stat
 import subprocess
@@ -18,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from conftest import unavailable
+from bridge.store.disks import fill_up
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.records import RecordId, SealedRecord, SeqRange
 from rosbridge_eth.store import Delivery, Spool, SpoolFull, SpoolLimits
@@ -309,26 +308,10 @@ def test_a_damaged_spool_is_kept_aside_and_the_next_start_begins_anew(path, spoi
         assert (spool.pending(9), spool.last) == ([], None)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A real file system of 1 MiB, or a skip where none can be mounted."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = shutil.which("mount")
-    done = mount and subprocess.run([mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True)
-    if not done or done.returncode != 0:
-        unavailable("a small file system cannot be mounted here (needs root)")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
 def test_a_full_disk_takes_nothing_new_loses_nothing_old_and_recovers(small_disk):
-    ballast = small_disk / "ballast"
     with Spool(small_disk / "spool.db", ROBOT, SpoolLimits(group=1, unwritten=20)) as spool:
         fill(spool, range(20))
-        with ballast.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
-            while True:
-                file.write(bytes(512))
+        ballast = fill_up(small_disk)
         refused = []
         for seq in range(20, 500):
             try:
