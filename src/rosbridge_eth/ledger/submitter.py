@@ -256,6 +256,7 @@ class Submitter:
         self._jobs = {job.id: job for job in journal.jobs()}
         self._leases: dict[str, Lease] = {}
         self._not_ours: set[str] = set()
+        self._stale = False  # an account came to us that another submitter may have acted for
         self._head: Block | None = None
         self._tip = 0
         self._views: dict[str, AccountView] = {}
@@ -352,6 +353,10 @@ class Submitter:
             return []
         head = None if now >= self._next_poll else self._head
         wanted: list[Action] = [ReadHead()] if head is None else self._round(head, now)
+        if self._stale and head is not None:
+            self._jobs = {job.id: job for job in self._journal.jobs()}
+            self._stale = False
+            wanted = self._round(head, now)
         fresh = [action for action in wanted if action not in self._asked]
         self._asked.update(fresh)
         return fresh
@@ -396,6 +401,8 @@ class Submitter:
                 self._leases.pop(account, None)
                 self._not_ours.add(account)
                 return False
+            mine = self._leases.get(account)
+            self._stale = self._stale or mine is None or mine.token != lease.token
             self._leases[account] = lease
             self._not_ours.discard(account)
         return True
@@ -422,8 +429,9 @@ class Submitter:
         self._fill_gaps(account, robot, view, now)
         in_flight = [job for job in with_nonce if job.state in IN_FLIGHT]
         first = next((job for job in in_flight if job.nonce == view.nonce), None)
-        wanted = [] if first is None else self._urge(first, head, now)
-        in_flight = [self._jobs[job.id] for job in in_flight]  # as they are after that
+        wanted = [] if first is None else self._urge(first, view, head, now)
+        now_so = (self._jobs.get(job.id) for job in in_flight)  # as they are after that
+        in_flight = [job for job in now_so if job is not None and job.state in IN_FLIGHT]
         ready = [job for job in in_flight if job.state is State.READY and self._due(job, now)]
         if ready:
             wanted.append(Broadcast(tuple(self._journal.latest_attempt(job) for job in ready)))
@@ -447,12 +455,15 @@ class Submitter:
         return retry is None or now >= retry.at
 
     def _affordable(self, job: Job, spendable: int, head: Block) -> bool:
-        """A first look, before the estimate: what is surely too dear waits for a top-up."""
+        """A first look, before the estimate: what is surely too dear waits for a top-up.
+
+        Not for a robot that is blocked: only the contract can say that it is so no more.
+        """
         base = head.base_fee or 0
         if job.kind is Kind.TOP_UP:
             self._treasury_empty = spendable < job.value + 100_000 * base
             return not self._treasury_empty
-        return spendable > 21_000 * base
+        return spendable > 21_000 * base or job.robot in self._blocked
 
     def _call(self, job: Job, account: str) -> Call:
         if job.kind is Kind.BATCH:
@@ -483,14 +494,14 @@ class Submitter:
             self._keep(self._journal.top_up(batch.robot, account, amount, self._leases[self._operator.address], now))
             self._poor.discard(account)
 
-    def _urge(self, job: Job, head: Block, now: float) -> list[Action]:
+    def _urge(self, job: Job, view: AccountView, head: Block, now: float) -> list[Action]:
         """The lowest nonce that waits holds up all others."""
         if job.state is not State.PENDING or job.fees is None or job.signed_at is None:
             return []
         settings, attempt = self._settings, self._journal.latest_attempt(job)
         payable = head.base_fee is None or job.fees.max_fee >= head.base_fee
         wait = self._waits.get(job.account or "")
-        if wait is None or wait.job != job.id or not payable:
+        if wait is None or wait.job != job.id or not payable or view.balance < _cost(job):
             wait = self._waits[job.account or ""] = _Wait(job.id, attempt.hash, head.number)
         if job.bumps >= settings.stuck_bumps and head.number - wait.since_block >= settings.stuck_blocks:
             del self._waits[job.account or ""]
@@ -682,6 +693,7 @@ class Submitter:
         account = self._account_for(job) or ""
         name = failure.name if isinstance(failure, Reverted) else ""
         if isinstance(failure, InsufficientFunds) or name == "NoBalance":
+            self._blocked.pop(job.robot, None)  # the contract looks at the balance last
             self._short_of_money(job, account, now)
         elif job.kind is Kind.TOP_UP and name in _ALLOC_NOT_ALLOWED:
             self._drop_top_up(job, str(failure), now)

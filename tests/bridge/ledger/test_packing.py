@@ -66,6 +66,11 @@ def shared_ledger() -> Ledger:
     return new_ledger()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _evm_is_there():
+    shared_ledger()  # importing py-evm changes the recursion limit, which hypothesis would notice
+
+
 @settings(max_examples=60)
 @given(data=st.data(), records=RECORDS)
 def test_python_and_the_contract_take_and_refuse_the_same_bytes(data, records):
