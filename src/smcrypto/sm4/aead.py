@@ -14,7 +14,7 @@ from hmac import compare_digest
 
 from smcrypto.errors import InvalidLength, InvalidTag
 from smcrypto.inputs import BytesLike, as_bytes
-from smcrypto.sm4.engine import Engine
+from smcrypto.sm4.engine import Engine, xor_bytes
 from smcrypto.sm4.ghash import GHASH
 
 __all__ = ["SM4CCM", "SM4GCM"]
@@ -24,10 +24,7 @@ _ONE = b"\0\0\0\1"
 # SP 800-38D, 5.2.1.1: 2^39 - 256 bits of plaintext, 2^64 - 1 bits of associated data and of nonce (whole bytes).
 _GCM_TEXT = 2**36 - 32
 _GCM_BYTES = 2**61 - 1
-
-
-def _xor(a: bytes, b: bytes) -> bytes:
-    return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
+_ONE_PASS = 4096  # bytes up to which decryption makes E(K, J_0) and the key stream together
 
 
 def _checked_tag_length(tag_length: int, allowed: tuple[int, ...]) -> int:
@@ -83,8 +80,9 @@ class SM4GCM:
     def decrypt(self, nonce: BytesLike, data: BytesLike, associated_data: BytesLike = b"") -> bytes:
         """The plaintext of `data` = ciphertext ‖ tag; InvalidTag unless all three are as they were sealed.
 
-        The tag is compared, in constant time, before anything is decrypted. Data shorter than a tag is
-        InvalidTag as well. Source: SP 800-38D, 7.2.
+        The tag is compared, in constant time, before anything is decrypted. (For messages up to 4 KiB the key
+        stream is there by then, since E(K, J_0) costs nothing beside it; it meets the ciphertext afterwards.)
+        Data shorter than a tag is InvalidTag as well. Source: SP 800-38D, 7.2.
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
         _check_gcm_lengths(len(nonce), len(data) - self._t, len(A))
@@ -92,9 +90,12 @@ class SM4GCM:
             raise InvalidTag("the message is not authentic")
         C, T = data[: -self._t], data[-self._t :]
         J_0 = self._J_0(nonce)
-        if not compare_digest(self._tag(self._engine.encrypt(J_0), A, C), T):
-            raise InvalidTag("the message is not authentic")
-        return self._engine.ctr_xor(_inc32(J_0), C, 32)
+        if len(C) > _ONE_PASS:
+            self._check(self._engine.encrypt(J_0), A, C, T)
+            return self._engine.ctr_xor(_inc32(J_0), C, 32)
+        mask, stream = self._engine.encrypt_and_ctr_xor(J_0, _inc32(J_0), bytes(len(C)), 32)
+        self._check(mask, A, C, T)
+        return xor_bytes(stream, C)
 
     def __repr__(self) -> str:
         return f"<SM4GCM tag_length={self._t}>"
@@ -112,6 +113,10 @@ class SM4GCM:
         if len(nonce) == 12:
             return nonce + _ONE
         return self._hash(b"", nonce).to_bytes(16, "big")
+
+    def _check(self, mask: bytes, A: bytes, C: bytes, T: bytes) -> None:
+        if not compare_digest(self._tag(mask, A, C), T):
+            raise InvalidTag("the message is not authentic")
 
     def _tag(self, mask: bytes, A: bytes, C: bytes) -> bytes:
         """GHASH of the message XOR mask = E(K, J_0), cut to t bytes: step 6 of 7.1."""
@@ -196,10 +201,8 @@ class SM4CCM:
              length, A, bytes(-(len(length) + len(A)) % 16),
              P, bytes(-len(P) % 16))
         )
-        Y = _ZERO
-        for i in range(0, len(B), 16):
-            Y = self._engine.encrypt(_xor(Y, B[i : i + 16]))
-        return _xor(Y, S_0)[: self._t]
+        Y = self._engine.cbc_encrypt(_ZERO, B)[-16:]
+        return xor_bytes(Y, S_0)[: self._t]
 
 
 def _counter_block(N: bytes, text: int) -> bytes:

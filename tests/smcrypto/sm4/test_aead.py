@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from smcrypto import InvalidKey, InvalidLength, InvalidTag
 from smcrypto.sm4 import SM4, SM4CCM, SM4GCM, aead
+from smcrypto.sm4.engine import Engine
 from smcrypto.sm4.ghash import ghash_by_definition
 from vectors_json import load
 
@@ -237,21 +238,24 @@ def test_the_refusal_tells_nothing(cipher):
     assert messages == {"the message is not authentic"}
 
 
-def test_gcm_decrypts_nothing_before_the_tag_is_right(monkeypatch):
-    gcm = SM4GCM(KEY)
-    sealed = gcm.encrypt(NONCE, TEXT)
-    decrypted = []
-    original = type(gcm._engine).ctr_xor
+@pytest.mark.parametrize("length", [300, 4096, 4097, 9000])
+def test_gcm_decrypts_nothing_before_the_tag_is_right(length, monkeypatch):
+    """The cipher is not shown the ciphertext, so no plaintext can exist."""
+    gcm, text = SM4GCM(KEY), random.Random(length).randbytes(length)
+    sealed = gcm.encrypt(NONCE, text)
+    shown: list[bytes] = []
+    for name in ("encrypt", "ctr_xor", "encrypt_and_ctr_xor"):
+        original = getattr(Engine, name)
 
-    def watched(self, *arguments):
-        decrypted.append(arguments)
-        return original(self, *arguments)
+        def watched(self, *arguments, original=original):
+            shown.extend(argument for argument in arguments if isinstance(argument, bytes))
+            return original(self, *arguments)
 
-    monkeypatch.setattr(type(gcm._engine), "ctr_xor", watched)
+        monkeypatch.setattr(Engine, name, watched)
     with pytest.raises(InvalidTag):
         gcm.decrypt(NONCE, sealed[:-1] + bytes([sealed[-1] ^ 1]))
-    assert not decrypted
-    assert gcm.decrypt(NONCE, sealed) == TEXT and decrypted
+    assert shown and sealed[:-16] not in shown
+    assert gcm.decrypt(NONCE, sealed) == text
 
 
 @pytest.mark.parametrize("length", [0, 15, 17, 32])
