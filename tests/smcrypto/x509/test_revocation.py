@@ -46,14 +46,41 @@ def test_a_list_says_what_was_put_in() -> None:
     assert SUB.crl().revoked == ()
 
 
-@pytest.mark.parametrize(
-    "reason",
-    ["unspecified", "keyCompromise", "cACompromise", "affiliationChanged", "superseded", "cessationOfOperation",
-     "certificateHold", "privilegeWithdrawn", "aACompromise"],
-)  # fmt: skip
+# RFC 5280, 5.3.1
+REASONS = {
+    "keyCompromise": 1,
+    "cACompromise": 2,
+    "affiliationChanged": 3,
+    "superseded": 4,
+    "cessationOfOperation": 5,
+    "certificateHold": 6,
+    "privilegeWithdrawn": 9,
+    "aACompromise": 10,
+}
+
+
+@pytest.mark.parametrize("reason", REASONS)
 def test_every_reason(reason: str) -> None:
     crl = SUB.crl(RevokedCertificate(5, NOW, reason))
     assert crl.revoked == (RevokedCertificate(5, NOW, reason),)
+    assert der.oid("2.5.29.21") + der.octet_string(der.enumerated(REASONS[reason])) in crl.to_der()
+
+
+def test_an_unspecified_reason_is_not_written() -> None:
+    crl = SUB.crl(RevokedCertificate(5, NOW, "unspecified"))
+    assert crl.revoked == (RevokedCertificate(5, NOW),) and der.oid("2.5.29.21") not in crl.to_der()
+
+
+def test_numbers_fit_20_bytes() -> None:
+    assert SUB.crl(number=2**159 - 1).number == 2**159 - 1 and SUB.crl(number=0).number == 0
+    with pytest.raises(InvalidOption, match="20 bytes"):
+        SUB.crl(number=2**159)
+
+
+def test_a_list_is_fresh_from_its_first_to_its_last_second() -> None:
+    for at in (NOW, NOW + timedelta(days=7)):
+        CRL.require_fresh(at)
+    assert SUB.crl(next_update=NOW).next_update == NOW
 
 
 def test_making_a_list_refuses_what_cannot_be_written() -> None:
@@ -179,6 +206,9 @@ def listed(*extensions: x509.Extension) -> bytes:
     return der.explicit(0, der.sequence(*(e.to_der() for e in extensions)))
 
 
+TRIFLE = der.sequence(x509.Extension("1.2.3", False, der.null()).to_der())
+
+
 def test_a_version_1_list() -> None:
     crl = crl_of(version=b"", entries=der.sequence(entry(5)))
     crl.verify(SUB.certificate)
@@ -221,6 +251,10 @@ def test_unknown_extensions_that_are_not_critical_are_no_matter() -> None:
         {"entries": der.sequence(entry(5, x509.Extension("2.5.29.21", False, der.enumerated(8))))},
         {"entries": der.sequence(entry(5, x509.Extension("2.5.29.21", False, der.integer(1))))},
         {"entries": der.sequence(der.sequence(der.integer(5)))},
+        {"entries": der.sequence(entry(5)[:1] + bytes([entry(5)[1] + 4]) + entry(5)[2:] + der.null() + der.null())},
+        {"entries": der.sequence(der.sequence(der.integer(5), der.time(NOW), TRIFLE, der.null()))},
+        {"entries": der.sequence(entry(5, x509.Extension("2.5.29.21", False, der.enumerated(1) + der.null())))},
+        {"extensions": listed(x509.Extension("2.5.29.20", False, der.integer(1) + der.null()))},
         {"version": b"", "extensions": listed(x509.Extension("1.2.3", False, der.null()))},
         {"extensions": der.explicit(0, der.sequence())},
         {"extensions": der.explicit(1, der.null())},
