@@ -175,7 +175,7 @@ def odd_multiples(P: Point, count: int, curve: Curve) -> list[Point]:
     # 2P with Z = 2y, and P with the same Z: (4xy^2, 8y^4).
     yy = y * y % p
     X2, Y2 = 4 * x * yy % p, 8 * yy * yy % p
-    slope = 3 * x * x + curve.a
+    slope = (3 * x * x + curve.a) % p
     X1 = (slope * slope - 2 * X2) % p
     Y1 = (slope * (X2 - X1) - Y2) % p
     Z = 2 * y
