@@ -173,7 +173,7 @@ def _checked(data: Any, kind: numpy.dtype[Any], path: str) -> Any:
     if kind.kind == "f":
         if isinstance(data, str) and data in _NOT_FINITE:
             return _NOT_FINITE[data]
-        if type(data) is float and abs(data) <= numpy.finfo(kind).max:
+        if type(data) is float and abs(data) <= float(numpy.finfo(kind).max):
             return data
     elif kind.kind == "b":
         if type(data) is bool:

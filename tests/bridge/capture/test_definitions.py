@@ -277,7 +277,7 @@ module pkg {
     @verbatim (language="comment", text=
       "what it is for")
     struct Outer {
-      @unit (value="m")
+      @vendor::unit (value="m")
       geometry_msgs::msg::Point point;
       double__36 covariance;
       sequence<uint8> data;
@@ -286,6 +286,7 @@ module pkg {
       @default (value=3)
       octet a, b[2];
       Inner inner;
+      ::pkg::msg::Inner absolute;
       boolean flag;
     };
   };
@@ -315,6 +316,7 @@ def test_idl_as_rosidl_generates_it():
         "a": (base, ("byte", 0)),
         "b": (array, ((base, ("byte", 0)), 2)),
         "inner": (name, "pkg/msg/Inner"),
+        "absolute": (name, "pkg/msg/Inner"),
         "flag": (base, ("bool", 0)),
     }
 
@@ -333,11 +335,17 @@ def test_idl_as_rosidl_generates_it():
         "module pkg { module msg { struct T { long x[2][2]; }; }; };",
         "module pkg { module msg { struct T { long x[N]; }; }; };",
         "module pkg { module msg { struct T : U { long x; }; }; };",
+        "module pkg { module msg { struct T { unsigned float x; }; }; };",
+        "module pkg { module msg { struct T { sequence<sequence<long>> x; }; }; };",
+        "module pkg { module msg { typedef long L[2]; struct T { L x[2]; }; }; };",
+        "module pkg { module msg { struct T { long double x; }; }; };",
+        "module pkg { module msg { struct T { long x } }; };",
+        "module pkg { module msg { struct T { long x; }; struct T { long y; }; }; };",
         "@" * 1000,
         "@a(" * 10_000,
         "é",
     ],
-    ids=range(14),
+    ids=range(20),
 )
 @pytest.mark.timeout(10)
 def test_hostile_idl_is_refused_quickly(text):

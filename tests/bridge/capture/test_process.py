@@ -80,6 +80,18 @@ def test_a_record_that_could_not_be_sealed_is_refused():
     assert [notice.cause for notice in notices] == [Cause.RECORD_TOO_LARGE]
 
 
+def test_the_bound_on_a_record_is_in_bytes_of_its_json():
+    decoder = decoder_for(Wire.ROS1, "pkg/Words", "string[] s")
+    frame = len('{"s":[""]}')
+    for letter, size in (("x", 1), ("ü", 2)):
+        for letters, fits in ((MAX_DATA - frame) // size, True), ((MAX_DATA - frame) // size + 1, False):
+            encoded = (letter * letters).encode()
+            raw = pack("<II", 1, len(encoded)) + encoded
+            capture = Capture([TopicRule("/w", limit=1 << 20)], lambda notice: None)
+            record = capture.process(RawMessage("/w", "pkg/msg/Words", 0, raw, decoder), 0, 0)
+            assert (record is not None) is fits, (letter, letters)
+
+
 def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
     capture = Capture([TopicRule("/n", fields=("y",))])
     with pytest.raises(ConfigError, match="has no field 'y'"):

@@ -135,3 +135,13 @@ def test_what_was_not_captured_is_zero_and_named():
 def test_data_that_does_not_fit_the_type_is_refused(data):
     with pytest.raises(VerificationError, match="does not fit"):
         Restoration(decoder_for(Wire.ROS1, "pkg/Type", TEXT)).restore(data)
+
+
+def test_a_float32_holds_its_largest_value_and_no_larger_one():
+    largest = 3.4028234663852886e38
+    restoration = Restoration(decoder_for(Wire.ROS1, "pkg/Type", "float32 f\nfloat32[] fs"))
+    restored = restoration.restore({"f": largest, "fs": [-largest, "NaN"]})
+    assert (restored.message.f, restored.message.fs[0]) == (largest, -largest)
+    for data in ({"f": 3.5e38}, {"fs": [-3.5e38]}, {"f": 1e308}):
+        with pytest.raises(VerificationError, match="does not fit"):
+            restoration.restore(data)
