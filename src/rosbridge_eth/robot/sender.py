@@ -68,13 +68,12 @@ class Sender:
         self._unconfirmed: dict[RecordId, None] = {}  # stored, waiting for the chain; oldest first
         self._next_check = 0.0
         self._resume_at = 0.0
-        self._drained = False
         self.statistics = SenderStatistics()
 
     @property
     def idle(self) -> bool:
         """Nothing is on its way and nothing waits in the spool to go."""
-        return self._drained and not self._records and not self._unconfirmed and self._spool.next_commit() is None
+        return not self._records and not self._unconfirmed and self._spool.empty
 
     def next_timer(self) -> float | None:
         """When `send` should be called although no event came (monotonic seconds)."""
@@ -97,8 +96,7 @@ class Sender:
         while self._client.writable(now):
             # One by one: what a full window does not take must not be handed out.
             records = self._spool.pending(1)
-            self._drained = not records
-            if self._drained:
+            if not records:
                 break
             message = self._client.send(protocol.encode_request(RecordRequest(records[0])))
             self._records[message] = records[0].id

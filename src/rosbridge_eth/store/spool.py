@@ -165,6 +165,12 @@ class Spool:
             return self._last
 
     @property
+    def empty(self) -> bool:
+        """Everything that was ever appended is acknowledged or dropped; control records count here."""
+        with self._lock, self._translated():
+            return not self._waiting and not self._handed and next(self._candidates(), None) is None
+
+    @property
     def statistics(self) -> SpoolStatistics:
         with self._lock:
             return SpoolStatistics(
