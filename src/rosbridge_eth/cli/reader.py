@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,12 +69,13 @@ def read(
     chosen = choice.choose(reading.proven.records)
     records = [record.proven for record in chosen]
     if bag is not None:
-        outputs.write_bag(bag, records)
+        written = outputs.write_bag(bag, records)
+        talk(f"{bag}: {written.whole} messages whole, {written.partial} in part, {written.as_json} as JSON")
     if plot is not None:
         outputs.draw_trajectory(plot, records)
     if bag is None and plot is None and not json:
         for record in records:
-            print_json(outputs.as_json(record))
+            sys.stdout.write(outputs.json_line(record))
     findings = [str(problem) for problem in reading.history.problems] + [str(f) for f in reading.proven.findings]
     if json:
         print_json(_summary(reading, findings, [outputs.as_json(record) for record in records]))
