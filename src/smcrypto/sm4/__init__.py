@@ -19,6 +19,7 @@ from smcrypto.sm4.modes import (
     XTS,
     Cipher,
     CipherStream,
+    Mode,
     decrypt,
     encrypt,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "XTS",
     "Cipher",
     "CipherStream",
+    "Mode",
     "decrypt",
     "encrypt",
 ]

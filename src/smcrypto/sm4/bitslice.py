@@ -8,7 +8,7 @@ Transposed, it is 128 planes of n bits:
     bit i of a block         =   bit of weight 2**(i % 8) in its byte i // 8
 
 so that every operation below works on all n blocks, and a rotation of words
-merely renames planes. Rows and planes are each other's `transpose`.
+merely renames planes. `transpose` leads from one to the other and back.
 
 The S-box is a circuit of 105 gates (SBOX_CIRCUIT); with L in 3 XORs a bit, the
 round input in 2.5 and the key in 1, a round is 4 * 105 + 6.5 * 32 = 628
@@ -34,7 +34,6 @@ __all__ = [
     "ctr_xor",
     "key_planes",
     "rows_from_bytes",
-    "rows_to_bytes",
     "transpose",
 ]
 
@@ -116,12 +115,6 @@ def rows_from_bytes(data: bytes, width: int) -> list[int]:
     """128 rows of `width` blocks; `data` may be shorter, what is missing is zero."""
     size = 16 * width
     return [int.from_bytes(data[start : start + size], "little") for start in range(0, 128 * size, size)]
-
-
-def rows_to_bytes(rows: Sequence[int], width: int) -> bytes:
-    """The 2048 * `width` bytes of 128 rows."""
-    size = 16 * width
-    return b"".join([row.to_bytes(size, "little") for row in rows])
 
 
 @lru_cache(maxsize=8)

@@ -335,17 +335,16 @@ def _transform(cipher: Cipher, *, encrypting: bool) -> _Transform:
     if isinstance(mode, XTS):
         return XTSStream(cipher.key, mode.tweak, mode.variant, encrypting=encrypting)
     engine = Engine(cipher.key)
-    match mode:
-        case CTR():
-            return _KeyStream(_CTR(engine, mode.nonce))
-        case OFB():
-            return _KeyStream(_OFB(engine, mode.iv))
-        case CFB():
-            return _CFB(engine, mode.iv, encrypting=encrypting)
-        case ECB():
-            inner = _Blocks(engine.encrypt if encrypting else engine.decrypt)
-        case CBC():
-            inner = _Blocks(_CBCEncrypt(engine, mode.iv) if encrypting else _CBCDecrypt(engine, mode.iv))
+    if isinstance(mode, CTR):
+        return _KeyStream(_CTR(engine, mode.nonce))
+    if isinstance(mode, OFB):
+        return _KeyStream(_OFB(engine, mode.iv))
+    if isinstance(mode, CFB):
+        return _CFB(engine, mode.iv, encrypting=encrypting)
+    if isinstance(mode, ECB):
+        inner = _Blocks(engine.encrypt if encrypting else engine.decrypt)
+    else:
+        inner = _Blocks(_CBCEncrypt(engine, mode.iv) if encrypting else _CBCDecrypt(engine, mode.iv))
     if cipher.padding is None:
         return inner
     return _Pad(inner) if encrypting else _Unpad(inner)

@@ -61,14 +61,12 @@ def _runs(first: bytes) -> Iterator[bytes]:
 
 def tweak_sequence(first: bytes, n: int, variant: Variant) -> bytes:
     """T_0 = `first`, T_1, ... T_(n-1), joined."""
-    runs, length = [], 0
-    for run in _runs(first.translate(_REVERSED) if variant == "gb" else first):
-        runs.append(run)
-        length += len(run)
-        if length >= 16 * n:
-            break
-    tweaks = b"".join(runs)[: 16 * n]
-    return tweaks.translate(_REVERSED) if variant == "gb" else tweaks
+    runs = _runs(first.translate(_REVERSED) if variant == "gb" else first)
+    tweaks = bytearray()
+    while len(tweaks) < 16 * n:
+        tweaks += next(runs)
+    del tweaks[16 * n :]
+    return bytes(tweaks.translate(_REVERSED) if variant == "gb" else tweaks)
 
 
 class XTSStream:
