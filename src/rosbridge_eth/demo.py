@@ -54,7 +54,10 @@ SETTLE = 60.0  # seconds for the last batch to be confirmed
 
 @dataclass(slots=True)
 class Stages:
-    """How many records reached each stage, and how long each took (seconds)."""
+    """How many records reached each stage, and how long each took (seconds).
+
+    From `sent` on, the stream's own records count too: one that opens it, one that ends it.
+    """
 
     captured: int = 0
     sent: int = 0

@@ -6,6 +6,8 @@ act on is one sentence on stderr and never a traceback.
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 
 import typer
@@ -36,6 +38,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return int(error.exit_code)
     except SystemExit as stop:  # how typer ends: 0, or 2 for a usage error it has explained
         return stop.code if isinstance(stop.code, int) else int(ExitCode.OK)
+    except BrokenPipeError:  # `read | head`: whoever took the data has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return int(ExitCode.FAILED)
     except KeyboardInterrupt:
         talk("rosbridge-eth: interrupted")
         return 130

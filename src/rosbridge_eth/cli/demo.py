@@ -59,8 +59,11 @@ def demo(
     (report / "records.jsonl").write_text("".join(outputs.json_line(record) for record in proven), encoding="utf-8")
     outputs.draw_trajectory(report / "trajectory.png", proven)
 
-    counts = [(name, getattr(stages, name)) for name in
-              ("captured", "sent", "retransmitted", "stored", "included", "verified")]
+    labels = {
+        "captured": "captured", "sent": "sent, with the stream's open and end", "retransmitted": "frames retransmitted",
+        "stored": "stored by the server", "included": "included in a block", "verified": "verified against the bag",
+    }
+    counts = [(label, getattr(stages, name)) for name, label in labels.items()]
     times = [(name, f"{seconds * 1000:.2f} ms") for name, seconds in stages.times.items()]
     batches = [
         (number, batch.records, batch.block_number, batch.gas_used, f"{batch.gas_used / batch.records:.0f}",
@@ -74,7 +77,7 @@ def demo(
     )
     if json:
         print_json({
-            "passed": result.passed, "seconds": result.seconds, "counts": dict(counts), "times": stages.times,
+            "passed": result.passed, "seconds": result.seconds, "counts": {name: getattr(stages, name) for name in labels}, "times": stages.times,
             "contract": result.contract, "findings": findings, "differences": list(result.comparison.differences),
             "batches": [dict(zip(("number", "records", "block", "gas", "gas_per_record", "transaction"), row,
                                  strict=True)) for row in batches],
