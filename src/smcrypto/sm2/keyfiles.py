@@ -178,9 +178,7 @@ def _read_pkcs8(data: bytes) -> int:
     _read_algorithm(info)
     key = info.octet_string()
     if info.has_explicit(0):
-        attributes = info.implicit_set_of(0)
-        while not attributes.at_end():
-            attributes.checked()
+        _skip_attributes(info.implicit_set_of(0))
     d = _read_sec1(key, curve_known=True)
     if info.has_implicit(1):
         if version == 0:
@@ -191,6 +189,17 @@ def _read_pkcs8(data: bytes) -> int:
         _require_pair(d, point[1:])
     info.finish()
     return d
+
+
+def _skip_attributes(attributes: der.Reader) -> None:
+    """They say nothing about the key (RFC 5958, 2), but must be attributes: a type and a set of values."""
+    while not attributes.at_end():
+        attribute = attributes.sequence()
+        attribute.oid()
+        values = attribute.set_of()
+        attribute.finish()
+        while not values.at_end():
+            values.checked()
 
 
 def _read_sec1(data: bytes, *, curve_known: bool) -> int:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from der_variants import overfull
 from smcrypto import InvalidKey, InvalidOption, MissingDependency, SMCryptoError, der, pem, sm2, sm4
 from smcrypto.sm2 import keyfiles
 from vectors_json import load
@@ -502,6 +503,46 @@ def test_encrypted_keys_that_are_refused(case: str) -> None:
     data, reason = WRONG_ENCRYPTED[case]
     with pytest.raises(InvalidKey, match=reason):
         sm2.PrivateKey.from_der(data, b"pw")
+
+
+FULL = {
+    "PKCS#8": pkcs8(
+        sec1(parameters=explicit()),
+        version=1,
+        tail=der.explicit(0, der.sequence(der.oid("1.2.3"), der.set_of(der.utf8_string("x"))))
+        + der.implicit(1, b"\0" + POINT),
+    ),
+    "SEC1": KEY.to_der(format="sec1"),
+    "explicit curve": pkcs8(sec1(), ALGORITHMS["explicit parameters"]),
+    "curve as algorithm": pkcs8(sec1(), ALGORITHMS["the curve as algorithm, named again"]),
+    "PBKDF2": encrypted(key_length=16),
+}
+
+
+@pytest.mark.parametrize("name", FULL)
+def test_no_container_takes_anything_more(name: str) -> None:
+    password = b"pw" if name == "PBKDF2" else None
+    assert sm2.PrivateKey.from_der(FULL[name], password) == KEY
+    variants = list(overfull(FULL[name]))
+    assert len(variants) >= 3
+    for data in variants:
+        with pytest.raises(InvalidKey):
+            sm2.PrivateKey.from_der(data, password)
+    for data in overfull(KEY.public_key.to_der()):
+        with pytest.raises(InvalidKey):
+            sm2.PublicKey.from_der(data)
+
+
+@pytest.mark.parametrize(("N", "r", "p"), [(2, 1, 1), (16, 8, 3), (1 << 14, 8, 1)])
+def test_scrypt_as_hashlib_computes_it(N: int, r: int, p: int) -> None:
+    key = hashlib.scrypt(b"pw", salt=b"salt", n=N, r=r, p=p, dklen=16)
+    ciphertext = sm4.encrypt(key, sm4.CBC(bytes(16)), KEY.to_der(), padding="pkcs7")
+    for length in (None, 16):
+        data = encrypted(derivation=scrypt(N, r, p, length), ciphertext=ciphertext)
+        assert sm2.PrivateKey.from_der(data, b"pw") == KEY
+    for variant in overfull(data):
+        with pytest.raises(InvalidKey):
+            sm2.PrivateKey.from_der(variant, b"pw")
 
 
 @pytest.mark.parametrize("oid", ["2.16.840.1.101.3.4.1.2", "1.2.840.113549.3.7"])

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from der_variants import overfull
 from smcrypto import CertificateError, InvalidKey, InvalidLength, InvalidOption, SMCryptoError, der, pem, sm2, sm3, x509
 from smcrypto.x509 import Certificate, CertificateSigningRequest, Extension, Name
 from vectors_json import load
@@ -437,6 +438,23 @@ MALFORMED = {
 def test_certificates_that_are_malformed(case: str) -> None:
     with pytest.raises(CertificateError, match="not a valid certificate"):
         certificate_of(**MALFORMED[case])
+
+
+def test_no_container_takes_anything_more() -> None:
+    crl = ROOT.crl(x509.RevokedCertificate(7, NOW, "superseded"))
+    old = certificate_of(version=b"")
+    algorithm, with_null = (der.sequence(der.oid("1.2.156.10197.1.501"), more) for more in (b"", der.null()))
+    length = len(CSR.to_der()) - 4
+    lengths = b"\x30\x82" + length.to_bytes(2, "big"), b"\x30\x82" + (length + 2).to_bytes(2, "big")
+    for value in (CERTIFICATE, ROOT.certificate, old, CSR, crl):
+        variants = list(overfull(value.to_der()))
+        assert len(variants) >= 10
+        for data in variants:
+            if value is CSR and data == value.to_der().replace(algorithm, with_null).replace(*lengths):
+                CertificateSigningRequest.from_der(data).verify()  # the algorithm's parameters may be NULL
+                continue
+            with pytest.raises(CertificateError):
+                type(value).from_der(data)
 
 
 def test_what_is_no_certificate() -> None:
