@@ -12,16 +12,17 @@ from smcrypto import InvalidLength, InvalidOption, kdf, sm3
 from vectors_json import load
 
 PBKDF2 = load("third_party/kdf_sm3.json", "pbkdf2_hmac_sm3")
+# 4,096 iterations take our own engine half a second for each 32 bytes.
+SOME_PBKDF2 = PBKDF2[:1] + PBKDF2[4::11]
 
 
-@pytest.mark.parametrize("v", PBKDF2)
+@pytest.mark.parametrize("v", PBKDF2 if sm3.ENGINE == "openssl" else SOME_PBKDF2)
 def test_pbkdf2_vectors(v):
     assert kdf.pbkdf2_hmac(v.password, v.salt, v.iterations, v.dklen) == v.dk
 
 
-@pytest.mark.parametrize("v", PBKDF2[:1] + PBKDF2[4::11])
+@pytest.mark.parametrize("v", SOME_PBKDF2)
 def test_pbkdf2_vectors_in_python(v):
-    """A choice: 4,096 iterations take this form half a second for each 32 bytes."""
     assert kdf._pbkdf2_python(v.password, v.salt, v.iterations, v.dklen) == v.dk
 
 

@@ -39,11 +39,9 @@ def test_vectors(v, sm3_engine):
     assert sm3.digest(v.msg) == v.digest
 
 
-@pytest.mark.parametrize("v", load("standards/sm3.json"))
+@pytest.mark.parametrize("v", [case for case in load("standards/sm3.json") if len(case.values[0].msg) < 1000])
 def test_the_transcribed_definition_gives_the_standards_values(v):
-    assert by_definition(v.msg[:100_000] if len(v.msg) > 100_000 else v.msg) == (
-        v.digest if len(v.msg) <= 100_000 else sm3.digest(v.msg[:100_000])
-    )
+    assert by_definition(v.msg) == v.digest
 
 
 @pytest.mark.parametrize("v", load("standards/hmac_sm3.json") + load("third_party/hmac_sm3.json"))
