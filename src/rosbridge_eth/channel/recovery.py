@@ -152,9 +152,6 @@ class InFlight(Generic[T]):
     def oldest(self) -> SentPacket[T] | None:
         return next(iter(self._packets.values()), None)
 
-    def latest(self) -> SentPacket[T] | None:
-        return next(reversed(self._packets.values()), None)
-
     def acknowledge(self, ranges: list[tuple[int, int]]) -> list[SentPacket[T]]:
         """Take out what `ranges` (inclusive, highest first) name; at most as many steps as are in flight."""
         self.largest_acked = max(self.largest_acked, ranges[0][1])
@@ -183,6 +180,13 @@ class InFlight(Generic[T]):
             del self._packets[packet.number]
             self.bytes -= packet.size
         return lost
+
+    def take_all(self) -> list[SentPacket[T]]:
+        """Take out everything."""
+        taken = list(self._packets.values())
+        self._packets.clear()
+        self.bytes = 0
+        return taken
 
     def loss_time(self, delay: float) -> float | None:
         """When the next packet below the largest acknowledged one will count as lost."""

@@ -480,7 +480,12 @@ class Session:
         return self._seal(bytes((Frame.CLOSE, CLOSE_CODES.get(reason, 0))), now)
 
     def path_changed(self, now: float) -> None:
-        """The peer is somewhere else: what was learnt of the path does not hold there (RFC 9000, 9.4)."""
+        """The peer is somewhere else: what was learnt of the path does not hold there (RFC 9000, 9.4).
+
+        What is in flight went to the old address, and most likely to nobody: it is sent again at once.
+        """
+        for packet in reversed(self._in_flight.take_all()):
+            self._again(packet, only_latest=True)
         self._round_trip = RoundTrip()
         self._congestion = Congestion(now, self.config.max_window)
         self._pto_count = 0
