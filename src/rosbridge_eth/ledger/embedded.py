@@ -98,6 +98,7 @@ class EmbeddedChain:
         self._blocks = [_Mined(self._chain.get_canonical_block_header_by_number(0), (), ())]
         self._pool: dict[bytes, dict[int, Any]] = {}
         self._held: set[bytes] = set()
+        self._forks = 0  # the beneficiary of blocks, so that those of a fork differ from those they replace
         self._mined_in: dict[bytes, Receipt] = {}
 
     # ------------------------------------------------------------------ Chain
@@ -216,6 +217,7 @@ class EmbeddedChain:
         with self._lock:
             if not 0 < depth < len(self._blocks):
                 raise ValueError(f"cannot take back {depth} of {len(self._blocks) - 1} blocks")
+            self._forks += 1
             removed = self._blocks[-depth:]
             del self._blocks[-depth:]
             pool, self._pool = self._pool, {}
@@ -363,7 +365,7 @@ class EmbeddedChain:
         while True:
             self._chain.header = self._next_header()
             try:
-                result, receipts, computations = self._chain.mine_all(chosen)
+                result, receipts, computations = self._chain.mine_all(chosen, coinbase=self._forks.to_bytes(20, "big"))
                 break
             except ValidationError:
                 # Balances change within a block: leave out what can no longer be paid for, the last one first.

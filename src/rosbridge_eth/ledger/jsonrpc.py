@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from itertools import count
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from rosbridge_eth.errors import ChainError
@@ -33,6 +33,7 @@ from rosbridge_eth.ledger.failures import (
     classify,
 )
 
+T = TypeVar("T")
 MAX_BATCH = 50  # requests in one batch; providers commonly allow 100
 MAX_PAUSE = 5.0  # seconds between attempts at most
 FALLBACK_PRIORITY_FEE = 1_000_000_000
@@ -246,50 +247,59 @@ class JsonRpcChain:
 
     # ------------------------------------------------------------------ Chain
 
+    def _read(self, read: Callable[[Any, str], T], method: str, *params: object) -> T:
+        """The result of one call in the form that `read` expects."""
+        try:
+            return read(self.request(method, *params), method)
+        except Garbled as failure:
+            raise self._named(failure) from failure
+
     def chain_id(self) -> int:
-        return _quantity(self.request("eth_chainId"), "eth_chainId")
+        return self._read(_quantity, "eth_chainId")
 
     def head(self) -> Block:
-        block = _block(self.request("eth_getBlockByNumber", "latest", False))
+        block = self._read(_block, "eth_getBlockByNumber", "latest", False)
         if block is None:
             raise self._named(Garbled("eth_getBlockByNumber: there is no latest block"))
         return block
 
     def block(self, number: int) -> Block | None:
-        return _block(self.request("eth_getBlockByNumber", hex(number), False))
+        return self._read(_block, "eth_getBlockByNumber", hex(number), False)
 
     def code(self, address: str) -> bytes:
-        return _data(self.request("eth_getCode", address, "latest"), "eth_getCode")
+        return self._read(_data, "eth_getCode", address, "latest")
 
     def balance(self, address: str) -> int:
-        return _quantity(self.request("eth_getBalance", address, "latest"), "eth_getBalance")
+        return self._read(_quantity, "eth_getBalance", address, "latest")
 
     def nonce(self, address: str, block: int | None = None) -> int:
-        return _quantity(self.request("eth_getTransactionCount", address, _tag(block)), "eth_getTransactionCount")
+        return self._read(_quantity, "eth_getTransactionCount", address, _tag(block))
 
     def priority_fee(self) -> int:
         try:
-            return _quantity(self.request("eth_maxPriorityFeePerGas"), "eth_maxPriorityFeePerGas")
+            return self._read(_quantity, "eth_maxPriorityFeePerGas")
         except (Unsupported, Refused):
             pass  # an older node; its gas price is base fee and tip together
-        price = _quantity(self.request("eth_gasPrice"), "eth_gasPrice")
+        price = self._read(_quantity, "eth_gasPrice")
         base_fee = self.head().base_fee
         return price if base_fee is None else max(price - base_fee, FALLBACK_PRIORITY_FEE)
 
     def call(self, call: Call, block: int | None = None) -> bytes:
-        return _data(self.request("eth_call", _call(call), _tag(block)), "eth_call")
+        return self._read(_data, "eth_call", _call(call), _tag(block))
 
     def estimate_gas(self, call: Call) -> int:
-        return _quantity(self.request("eth_estimateGas", _call(call)), "eth_estimateGas")
+        return self._read(_quantity, "eth_estimateGas", _call(call))
 
     def send(self, raws: Sequence[bytes]) -> list[bytes | NodeFailure]:
         answers = self._many("eth_sendRawTransaction", [["0x" + raw.hex()] for raw in raws])
-        return [a if isinstance(a, NodeFailure) else self._checked(_data, a, "eth_sendRawTransaction") for a in answers]
+        return [self._hash(answer, "eth_sendRawTransaction") for answer in answers]
 
-    def _checked(self, read: Callable[[Any, str], bytes], value: Any, method: str) -> bytes | NodeFailure:
+    def _hash(self, answer: Any, method: str) -> bytes | NodeFailure:
+        if isinstance(answer, NodeFailure):
+            return answer
         try:
-            return read(value, method)
-        except NodeFailure as failure:
+            return _data(answer, method, 32)
+        except Garbled as failure:
             return self._named(failure)
 
     def receipts(self, tx_hashes: Sequence[bytes]) -> list[Receipt | None]:
@@ -297,7 +307,10 @@ class JsonRpcChain:
         for answer in self._many("eth_getTransactionReceipt", [["0x" + hash.hex()] for hash in tx_hashes]):
             if isinstance(answer, NodeFailure):
                 raise answer
-            found.append(_receipt(answer))
+            try:
+                found.append(_receipt(answer))
+            except Garbled as failure:
+                raise self._named(failure) from failure
         return found
 
     def knows(self, tx_hash: bytes) -> bool:
@@ -306,10 +319,7 @@ class JsonRpcChain:
     def logs(self, address: str, topics: Sequence[bytes | None], from_block: int, to_block: int) -> list[Log]:
         wanted = [None if topic is None else "0x" + topic.hex() for topic in topics]
         where = {"address": address, "topics": wanted, "fromBlock": hex(from_block), "toBlock": hex(to_block)}
-        answer = self.request("eth_getLogs", where)
-        if not isinstance(answer, list):
-            raise self._named(Garbled("eth_getLogs: not a list"))
-        return [_log(item) for item in answer if not (isinstance(item, dict) and item.get("removed"))]
+        return self._read(_logs, "eth_getLogs", where)
 
 
 # ---------------------------------------------------------------------- reading what a node says
@@ -360,10 +370,10 @@ def _fields(value: object, where: str) -> dict[str, Any]:
     return value
 
 
-def _block(value: object) -> Block | None:
+def _block(value: object, where: str) -> Block | None:
     if value is None:
         return None
-    fields = _fields(value, "block")
+    fields = _fields(value, where)
     base_fee = fields.get("baseFeePerGas")
     return Block(
         _quantity(fields.get("number"), "block number"),
@@ -389,6 +399,12 @@ def _log(value: object) -> Log:
         _data(fields.get("transactionHash"), "log transaction hash", 32),
         _quantity(fields.get("logIndex"), "log index"),
     )
+
+
+def _logs(value: object, where: str) -> list[Log]:
+    if not isinstance(value, list):
+        raise Garbled(f"{where}: not a list")
+    return [_log(item) for item in value if not (isinstance(item, dict) and item.get("removed"))]
 
 
 def _receipt(value: object) -> Receipt | None:

@@ -781,7 +781,12 @@ def test_a_full_disk_ends_the_pump_and_loses_nothing(tmp_path: Path):
 def test_whatever_the_network_does_every_record_arrives_once(seed: int):
     chance = random.Random(seed)
     quick = Settings(
-        limits=Limits(records=3), bump_after=6.0, probe_after=3.0, max_in_flight=4, low_water=ETH // 50, top_up=ETH // 20
+        limits=Limits(records=3),
+        bump_after=6.0,
+        probe_after=3.0,
+        max_in_flight=4,
+        low_water=ETH // 50,
+        top_up=ETH // 20,
     )
     world = World(settings=quick, wei=ETH // 50)
 
