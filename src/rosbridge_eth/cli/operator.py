@@ -276,7 +276,7 @@ def check(
         print_json({"state": found.state, "transaction": found.transaction, "block": found.block, "proven": proven})
     else:
         where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
-        data.print(f"{found.state}{where}" + ("" if proven is None else f"; the contract says {str(proven).lower()}"))
+        typer.echo(f"{found.state}{where}" + ("" if proven is None else f"; the contract says {str(proven).lower()}"))
     if proven is False:
         raise VerificationError("the contract does not have the record that the store says it has")
 
