@@ -159,6 +159,7 @@ def test_nested_messages_keep_their_shape_and_order():
         (["many[1]"], {"many": {"1": {"x": 3, "name": "b"}}}),
         (["many[1].name", "many[0].x"], {"many": {"0": {"x": 2}, "1": {"name": "b"}}}),
         (["many[7].x"], {"many": {}}),
+        (["many[2].x", "many[1].x"], {"many": {"1": {"x": 3}}}),
         (["two[1].x"], {"two": {"1": {"x": 5}}}),
         (["nothing"], {"nothing": {}}),
     ],

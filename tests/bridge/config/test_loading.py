@@ -179,6 +179,12 @@ def test_all_mistakes_of_a_file_are_told_at_once():
         assert part in str(failure.value)
 
 
+def test_the_line_of_a_repeated_table_is_found():
+    text = '[[topics]]\ntopic = "/a"\n[[topics]]\ntopic = "/b"\n[[topics]]\ntopic = "/c"\nrate = -1\n'
+    with pytest.raises(ConfigError, match=r"line 7: topics\[2\]\.rate is -1"):
+        robot(text)
+
+
 def test_a_reader_needs_contract_ca_and_identity():
     with pytest.raises(ConfigError, match="contract is missing; ca is missing; identity is missing"):
         parse_config(ReaderConfig, "", Path("reader.toml"))
