@@ -215,6 +215,13 @@ def test_tagged_values() -> None:
     assert one(der.utf8_string("机器人"), lambda r: r.value(der.UTF8_STRING)).decode() == "机器人"
 
 
+def test_other_classes_are_passed_over_unread() -> None:
+    for data in (b"\x40\x01\xff", b"\xc0\x00", b"\x60\x03\x02\x01\x05"):
+        assert der.check(data) == data
+    with pytest.raises(InvalidEncoding):
+        der.check(b"\x60\x03\x02\x02\x05")
+
+
 # --- properties ---
 
 
