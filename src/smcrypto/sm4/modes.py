@@ -303,6 +303,11 @@ class Cipher:
 
     key: 16 bytes, for XTS 32; otherwise InvalidKey.
     padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+
+    >>> stream = Cipher(bytes(16), CTR(bytes(16))).encryptor()
+    >>> ciphertext = stream.update(b"any num") + stream.update(b"ber of bytes") + stream.finalize()
+    >>> ciphertext == encrypt(bytes(16), CTR(bytes(16)), b"any number of bytes")
+    True
     """
 
     key: bytes = field(repr=False)
@@ -357,6 +362,12 @@ def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = N
     data: whole blocks for ECB and CBC without padding, 16 bytes or more for
     XTS, otherwise InvalidLength; any length for CFB, OFB, CTR, and with padding.
     padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+
+    >>> import secrets
+    >>> key, iv = secrets.token_bytes(16), secrets.token_bytes(16)
+    >>> sealed = encrypt(key, CBC(iv), b"attack at dawn", padding="pkcs7")
+    >>> decrypt(key, CBC(iv), sealed, padding="pkcs7")
+    b'attack at dawn'
     """
     stream = Cipher(as_bytes(key, "key"), mode, padding=padding).encryptor()
     return stream.update(data) + stream.finalize()

@@ -1,4 +1,4 @@
-"""XTS, GB/T 17964-2021 clause 11 and IEEE 1619-2018: a tweak for each block, ciphertext stealing at the end.
+"""XTS, GB/T 17964-2021 and IEEE 1619-2018: a tweak for each block, ciphertext stealing at the end.
 
 T_0 = E(K_2, tweak), T_(j+1) = alpha * T_j in GF(2)[alpha] / (alpha^128 + alpha^7 + alpha^2 + alpha + 1), and
 a block becomes E(K_1, P ^ T) ^ T. The standards differ in which bit stands for which power:

@@ -13,7 +13,7 @@ from smcrypto import sm4
 from smcrypto.sm4 import block, tables
 from vectors_json import load
 
-# GB/T 32907-2016, table 1, row by row.
+# GB/T 32907-2016, 6.2 a), two rows of the table to a line.
 STANDARD_SBOX = bytes.fromhex("""
     d690e9fecce13db716b614c228fb2c05 2b679a762abe04c3aa44132649860699
     9c4250f491ef987a33540b43edcfac62 e4b31ca9c908e89580df94fa758f3fa6
