@@ -31,14 +31,18 @@ class SM4:
             raise InvalidKey(f"an SM4 key is 16 bytes, not {len(key)}")
         self._encrypt_keys = expand_key(key)
         self._decrypt_keys = self._encrypt_keys[::-1]
-        self._blocks = 0
+        self._blocks = 0  # a key that is used a lot gets the wide tables
 
     def encrypt_block(self, block: BytesLike) -> bytes:
         """The 16-byte ciphertext of a 16-byte block; another length is InvalidLength."""
-        self._blocks += 1  # a key that is used a lot gets the wide tables
-        return crypt_block(self._encrypt_keys, as_exact_bytes(block, "block", 16), self._blocks)
+        self._blocks += 1
+        if type(block) is not bytes or len(block) != 16:
+            block = as_exact_bytes(block, "block", 16)
+        return crypt_block(self._encrypt_keys, block, self._blocks)
 
     def decrypt_block(self, block: BytesLike) -> bytes:
         """The 16-byte plaintext of a 16-byte block; another length is InvalidLength."""
         self._blocks += 1
-        return crypt_block(self._decrypt_keys, as_exact_bytes(block, "block", 16), self._blocks)
+        if type(block) is not bytes or len(block) != 16:
+            block = as_exact_bytes(block, "block", 16)
+        return crypt_block(self._decrypt_keys, block, self._blocks)

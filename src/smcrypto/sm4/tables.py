@@ -111,20 +111,15 @@ def expand_key(key: bytes) -> tuple[int, ...]:
     return expand(tables, (a ^ FK[0], b ^ FK[1], c ^ FK[2], d ^ FK[3]), CK)
 
 
-def _kind(blocks: int) -> tuple[dict[str, Callable[..., Any]], Tables]:
-    """The wide tables where `blocks` are enough to pay for them."""
-    return _wide() if blocks >= WIDE_BLOCKS else _narrow()
-
-
 def crypt_block(rk: Sequence[int], block: bytes, blocks: int = 1) -> bytes:
     """One 16-byte block. blocks: how many the caller has had under this key, which decides on the tables."""
-    functions, tables = _kind(blocks)
+    functions, tables = _wide() if blocks >= WIDE_BLOCKS else _narrow()
     result: bytes = functions["block"](tables, rk, block)
     return result
 
 
 def _chained(mode: str, rk: Sequence[int], chain: bytes, data: bytes) -> bytes:
-    functions, tables = _kind(len(data) // 16)
+    functions, tables = _wide() if len(data) >= 16 * WIDE_BLOCKS else _narrow()
     count = len(data) // 4
     words = iter(struct.unpack(f">{count}I", data))
     return struct.pack(f">{count}I", *functions[mode](tables, rk, chain, words))
