@@ -6,7 +6,7 @@ Microseconds a block where n are given, key at hand; CPython 3.11, AMD EPYC, Ope
     tables           6.2    6.1    6.2                                                     (wide: 3.8 to 5)
     byte planes       20    8.0    5.2    1.6   0.68   0.37   0.33   0.33
     bit slices                                    14   0.79   0.36   0.33   0.17   0.12
-    OpenSSL          3.3    1.2    0.9   0.29   0.15   0.10   0.10   0.10   0.10   0.10   (0.4 to 3 us a call)
+    OpenSSL          3.3    1.2    0.9   0.29   0.15   0.10   0.10   0.10   0.10   0.10   (3 us of them for the call)
 
 Hence the two limits below. A fresh key costs 7 us, its byte planes 3 to 14, its bit planes 55.
 """
