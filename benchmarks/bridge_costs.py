@@ -33,7 +33,7 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule
 from rosbridge_eth.channel import Client, ClientConfig, MessageReceived, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.protocol import Registration, RecordStatus
+from rosbridge_eth.protocol import RecordStatus, Registration
 from rosbridge_eth.robot.process import TAKE, Robot
 from rosbridge_eth.robot.recorder import Recorder
 from rosbridge_eth.robot.sender import Sender
