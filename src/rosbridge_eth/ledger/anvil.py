@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Sequence
@@ -72,6 +73,16 @@ class Anvil:
         self.stop()
 
 
+def _require_free(port: int) -> None:
+    """Otherwise whatever listens there would answer in anvil's place."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another one") from error
+
+
 def start(
     port: int,
     *,
@@ -86,6 +97,7 @@ def start(
     every transaction gets its block at once. log: where its output goes (nowhere otherwise).
     ChainError if npx is missing, the port is taken or it does not start.
     """
+    _require_free(port)
     program = shutil.which("anvil")
     npx = shutil.which("npx")
     if program:
@@ -119,7 +131,7 @@ def start(
             if not anvil.running():
                 said = b"" if process.stderr is None else process.stderr.read()
                 words = said.decode(errors="replace").strip()[-300:]
-                raise ChainError(f"anvil ended while starting on port {port}; is the port in use? {words}".rstrip())
+                raise ChainError(f"anvil ended while starting on port {port}: {words}")
             try:
                 probe.chain_id()
                 return anvil

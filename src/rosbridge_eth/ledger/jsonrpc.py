@@ -16,6 +16,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from itertools import count
 from typing import Any, Protocol, TypeVar
 from urllib.parse import urlsplit
@@ -95,6 +96,7 @@ class WebSocketTransport:
         self._timeout = timeout
         self._lock = threading.Lock()
         self._socket: Any = None
+        self._open = ExitStack()
 
     def exchange(self, body: bytes) -> bytes:
         from websockets.exceptions import WebSocketException
@@ -103,7 +105,8 @@ class WebSocketTransport:
         with self._lock:
             try:
                 if self._socket is None:
-                    self._socket = connect(self._url, open_timeout=self._timeout, max_size=None)
+                    connection = connect(self._url, open_timeout=self._timeout, max_size=None)
+                    self._socket = self._open.enter_context(connection)
                 self._socket.send(body.decode())
                 answer = self._socket.recv(timeout=self._timeout)
             except TimeoutError as error:
@@ -116,9 +119,8 @@ class WebSocketTransport:
 
     def _reset(self) -> None:
         """After a failure the next answer on this connection could be that of an old request."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        self._socket = None
+        self._open.close()
 
     def close(self) -> None:
         with self._lock:
