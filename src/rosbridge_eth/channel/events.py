@@ -186,6 +186,8 @@ class ChannelConfig:
             raise ValueError(f"max_message must be 1 to 65535 bytes, not {self.max_message}")
         if self.max_unanswered < 1 or self.max_unanswered_bytes < self.max_message:
             raise ValueError("max_unanswered and max_unanswered_bytes must hold at least one message")
+        if not 1 <= self.rekey_packets <= 1 << 22:
+            raise ValueError(f"rekey_packets must be 1 to 2**22, not {self.rekey_packets}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

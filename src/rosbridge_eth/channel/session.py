@@ -51,6 +51,8 @@ PIECE_OVERHEAD = 64
 PERSISTENT_OUTAGE = 3
 """Unanswered probes after which the congestion window begins anew (RFC 9002, 7.6)."""
 PROBES = 2
+KEY_LIMIT = 1 << 23
+"""Packets under one key, after which the session ends (RFC 9001, 6.6: the limit of GCM with 128-bit keys)."""
 
 CLOSE_CODES = {
     End.CLOSED: 0,
@@ -468,7 +470,7 @@ class Session:
         self._last_sent = now
         if self._epoch_packets >= self.config.rekey_packets and self._update is None and self.established:
             self._rekey()
-        if number >= MAX_PACKET_NUMBER or self._epoch_packets > 4 * self.config.rekey_packets:
+        if number >= MAX_PACKET_NUMBER or self._epoch_packets >= KEY_LIMIT:
             self.end(End.EXHAUSTED)
         return self._out.seal(self.remote_cid, number, frames)
 

@@ -51,6 +51,8 @@ def test_every_message_arrives_once_and_is_answered_whatever_the_network_does(se
         jitter=draw.choice((0, 0.01, 0.1)),
     )
     network = Network(seed, faults)
+    sizes: set[int] = set()
+    network.watch = lambda data, source, target: sizes.add(len(data))
     limits = ServerConfig(
         modes=(mode,),
         max_unanswered=draw.choice((3, 32, 256)),
@@ -76,6 +78,7 @@ def test_every_message_arrives_once_and_is_answered_whatever_the_network_does(se
     told = f"seed {seed}: {robot.client.statistics()} {hub.server.statistics()}"
     assert finished, told
     assert robot.broken == [] and hub.broken == [], told
+    assert max(sizes) <= 1200, told
     assert sorted(set(hub.committed)) == sorted(set(sent)), told
     assert sorted(robot.answered) == sorted(sent), told
     assert hub.most_held <= limits.max_total_bytes + limits.max_message * limits.max_unanswered, told
@@ -96,6 +99,26 @@ def test_without_faults_nothing_is_sent_twice():
     assert network.run(lambda: robot.done)
     for end in (robot.client.statistics(), hub.server.statistics()):
         assert (end.packets_lost, end.frames_retransmitted, end.duplicates, dict(end.dropped)) == (0, 0, 0, {})
+    network.run(lambda: False, limit=1.0)
+    [connection] = hub.server._connections.values()
+    assert hub.server.statistics().held_bytes == 0  # given back while the session lives, not at its end
+    assert connection.session._incoming == {}
+    for session in (robot.client._session, connection.session):
+        assert session._round_trip.smoothed == pytest.approx(0.02, rel=0.5)
+        assert len(session._received.ranges) == 1 and not session._in_flight
+
+
+def test_datagrams_are_filled_to_the_last_byte_and_no_further():
+    for second, count in ((577, 1), (578, 2)):
+        network = Network(1, Faults())
+        ServerProgram(network)
+        robot = RobotProgram(network, [])
+        assert network.run(lambda robot=robot: bool(robot.events))
+        network.run(lambda: False, limit=1.0)
+        for size in (578, second):
+            robot.asked[robot.client.send(bytes(size))] = bytes(size)
+        sizes = [len(data) for data, _ in robot.client.datagrams_to_send(network.now)]
+        assert len(sizes) == count and max(sizes) <= 1200 and sum(sizes) >= 1200
 
 
 def test_many_small_messages_share_datagrams():
@@ -175,6 +198,7 @@ def test_after_an_outage_what_waited_does_not_come_as_a_flood():
     ServerProgram(network)
     robot = RobotProgram(network, [b"%05d" % i + bytes(1000) for i in range(100)])
     assert network.run(lambda: robot.done)
+    before = robot.client._session._congestion.window
     network.faults = Faults(loss=1.0)
     robot.to_send = [b"%05d" % i + bytes(1000) for i in range(2000)]
     robot.feed()
@@ -188,9 +212,10 @@ def test_after_an_outage_what_waited_does_not_come_as_a_flood():
     began = sent[0][0]
     network.run(lambda: robot.done)
     first = sum(size for when, size in sent if when <= began + 0.001)
-    round_trip = sum(size for when, size in sent if when <= began + 0.06)
+    three = sum(size for when, size in sent if when <= began + 0.13)
     assert first <= 2 * 1200  # two probes, no more
-    assert round_trip <= 10 * 1200
+    assert three <= (2 + 4 + 8 + 16) * 1200  # then slow start, from the beginning
+    assert before > 100_000  # though the window had been open wide
     assert robot.broken == []
 
 
@@ -222,3 +247,12 @@ def test_urgent_messages_overtake_the_others():
     assert network.run(lambda: robot.done)
     order = hub.committed
     assert order.index(b"urgent") == 0
+
+
+def test_two_machines_with_one_identity_do_not_take_turns_all_the_time():
+    network = Network(10, Faults(delay=0.02))
+    hub = ServerProgram(network)
+    RobotProgram(network, [b"one"])
+    RobotProgram(network, [b"two"], address=("198.51.100.8", 50001))
+    network.run(lambda: False, limit=60.0)
+    assert sum(isinstance(event, Connected) for event in hub.events) <= 60
