@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import struct
 import zlib
 from base64 import b64encode
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -48,25 +50,36 @@ VERIFY = partial(verify, ROBOT_KEY.public_key)
 T0 = 1_763_690_000_000_000_000
 DAY = 24 * 3600 * 10**9
 
-ODOMETRY = json.dumps(
-    {
-        "v": 1,
-        "topic": "/robot_1/odom",
-        "type": "nav_msgs/msg/Odometry",
-        "received_ns": 1763690000123456789,
-        "wall_ns": 1763690000123498765,
-        "mono_ns": 84120012345678,
-        "clock": True,
-        "delivery": "reliable",
-        "data": {
-            "header": {"stamp": 1763690000120000000, "frame_id": "odom"},
-            "child_frame_id": "base_link",
-            "pose": {"pose": {"position": {"x": -1.2345678901234567, "y": 0.9876543210987654, "z": 0.0}}},
-            "twist": {"twist": {"linear": {"x": 0.31415926535897931, "y": 0.0, "z": 0.0}}},
+def odometry(**pose_and_twist) -> bytes:
+    return json.dumps(
+        {
+            "v": 1,
+            "topic": "/robot_1/odom",
+            "type": "nav_msgs/msg/Odometry",
+            "received_ns": 1763690000123456789,
+            "wall_ns": 1763690000123498765,
+            "mono_ns": 84120012345678,
+            "clock": True,
+            "delivery": "reliable",
+            "data": {
+                "header": {"stamp": 1763690000120000000, "frame_id": "odom"},
+                "child_frame_id": "base_link",
+                **pose_and_twist,
+            },
         },
-    },
-    separators=(",", ":"),
-).encode()
+        separators=(",", ":"),
+    ).encode()
+
+
+ODOMETRY = odometry(
+    pose={"pose": {"position": {"x": -1.2345678901234567, "y": 0.9876543210987654, "z": 0.0}}},
+    twist={"twist": {"linear": {"x": 0.31415926535897931, "y": 0.0, "z": 0.0}}},
+)
+N = iter(n**0.5 / 7 for n in range(2, 99) if n**0.5 % 1)
+FULL_ODOMETRY = odometry(
+    pose={"pose": {"position": {axis: next(N) for axis in "xyz"}, "orientation": {axis: next(N) for axis in "xyzw"}}},
+    twist={"twist": {"linear": {axis: next(N) for axis in "xyz"}, "angular": {axis: next(N) for axis in "xyz"}}},
+)
 
 
 def sealer(*readers, **options):
@@ -85,8 +98,9 @@ def test_a_reader_gets_back_what_was_sealed_and_the_robots_signature():
     verify(ROBOT_KEY.public_key, "record", opened.bound + opened.payload, opened.signature)
 
 
-def test_an_odometry_record_fits_the_256_bytes_that_the_papers_figures_are_given_for():
-    *_, record = sealer().seal(ODOMETRY, T0)
+@pytest.mark.parametrize("payload", [ODOMETRY, FULL_ODOMETRY], ids=["planar", "all 13 numbers"])
+def test_an_odometry_record_fits_the_256_bytes_that_the_papers_figures_are_given_for(payload):
+    *_, record = sealer().seal(payload, T0)
     assert len(record.ciphertext) == 256
 
 
@@ -119,13 +133,14 @@ def test_the_layout_is_the_documented_one_checked_without_the_opener():
     bound = ROBOT + record.id.stream + (1).to_bytes(8, "big") + record.ciphertext[:10]
     padded = sm4.SM4GCM(key).decrypt((1).to_bytes(12, "big"), record.ciphertext[10:], bound)
     inflate = zlib.decompressobj(-15, zdict=DICTIONARY)
-    assert inflate.decompress(padded[64:]) == b"payload"
+    assert padded[64] == 1
+    assert inflate.decompress(padded[65:]) == b"payload"
     assert set(inflate.unused_data) == {0}
     verify(ROBOT_KEY.public_key, "record", bound + b"payload", padded[:64])
 
 
 def test_the_dictionary_is_part_of_the_format_and_does_not_change():
-    assert sm3.digest(DICTIONARY).hex() == "c17bc25999869b952ba4ffda83d4135d49c3191ebe126af1998ed0ce8e68e913"
+    assert sm3.digest(DICTIONARY).hex() == "7452f2af3f3f021c8166e8bcd6dd22b2b9cf542e3e006d2dde727a4a79728e3c"
 
 
 def test_every_flipped_bit_of_a_record_is_refused():
@@ -182,6 +197,28 @@ def test_a_co_reader_who_has_the_key_cannot_speak_for_the_robot():
     sealed = record.ciphertext[:10] + sm4.SM4GCM(key).encrypt((1).to_bytes(12, "big"), lie.ljust(230, b"\0"), bound)
     with pytest.raises(Forged):
         stream_of(opening).open(SealedRecord(record.id, sealed), VERIFY)
+
+
+def reseal(record, key, *, key_id=None, size=256, seq=None):
+    """What a robot with other software could seal under its own stream's key, correctly signed."""
+    head = b"\1\1" + (key_id or record.ciphertext[2:10])
+    bound = ROBOT + record.id.stream + (seq or record.id.seq).to_bytes(8, "big") + head
+    plain = (sign(ROBOT_KEY, "record", bound + b"payload") + pack(b"payload")).ljust(size - 26, b"\0")
+    sealed = sm4.SM4GCM(key).encrypt((seq or record.id.seq).to_bytes(12, "big"), plain, bound)
+    return SealedRecord(replace(record.id, seq=seq or record.id.seq), head + sealed)
+
+
+def test_even_the_robot_cannot_use_another_key_id_or_size():
+    """Or records of one stream could be told apart by marks that the format does not have."""
+    opening, record = sealer().seal(b"payload", T0)
+    stream = stream_of(opening)
+    key = READER.decrypt(next(iter(stream.opening.wrapped.values())), encoding="c1c3c2")
+    assert stream.open(reseal(record, key, seq=9), VERIFY).payload == b"payload"
+    with pytest.raises(Altered, match="another key"):
+        stream.open(reseal(record, key, key_id=b"other id"), VERIFY)
+    for size in (257, 300, 4096 + 300):
+        with pytest.raises(Malformed, match="bytes, which no record has"):
+            stream.open(reseal(record, key, size=size), VERIFY)
 
 
 def _opens(key, wrapped):
@@ -293,17 +330,68 @@ def test_a_failed_signature_leaves_no_hole():
 def test_a_small_record_cannot_unpack_to_a_large_memory():
     bomb = pack(bytes(MAX_PAYLOAD))
     assert len(unpack(bomb)) == MAX_PAYLOAD
-    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
+    for mode, text in ((b"\0", bytes(30_000_000)), (b"\1", b"\1" * 30_000_000)):
+        with pytest.raises(Malformed, match="unpacks to more"):
+            unpack(mode + deflated(text))
+    # Numbers are longer as text than as bytes: 2 bytes each, 20 in the text.
+    many = b"\3" * 15_000
     with pytest.raises(Malformed, match="unpacks to more"):
-        unpack(deflate.compress(bytes(30_000_000)) + deflate.flush())
+        unpack(b"\1" + deflated(many) + b"\x09" + b"\x7f" * 9 + b"\1\0" * 14_999)
 
 
-@pytest.mark.parametrize("change", [lambda p: p[:-1], lambda p: p + b"\1", lambda p: b"\xff" + p, lambda p: b""])
-def test_packed_payloads_that_are_cut_or_trailed_by_anything_but_zeros_are_refused(change):
-    packed = pack(b"payload " * 9)
-    assert unpack(packed + bytes(500)) == b"payload " * 9
+def deflated(text: bytes) -> bytes:
+    stream = zlib.compressobj(9, zlib.DEFLATED, -15)
+    return stream.compress(text) + stream.flush()
+
+
+@pytest.mark.parametrize("payload", [b"payload " * 9, ODOMETRY, b"\1" + ODOMETRY])
+@pytest.mark.parametrize(
+    "change",
+    [lambda p: p[:-1], lambda p: p + b"\1", lambda p: b"\xff" + p, lambda p: b"\2" + p[1:], lambda p: b"",
+     lambda p: p[:1]],
+)
+def test_packed_payloads_that_are_cut_or_trailed_by_anything_but_zeros_are_refused(change, payload):
+    packed = pack(payload)
+    assert unpack(packed + bytes(500)) == payload
     with pytest.raises(Malformed):
         unpack(change(packed))
+
+
+def test_numbers_are_taken_out_as_documented():
+    """0.1 of a float32, a double, an integer, one that is 5 less, and what has to stay as it is."""
+    payload = b"[0.10000000149011612,0.1234567890123,1763690000000000005,1763690000000000000,1.5,-0.00000001,0000012]"
+    packed = pack(payload)
+    inflate = zlib.decompressobj(-15, zdict=DICTIONARY)
+    assert inflate.decompress(packed[1:]) == b"[\2,\1,\3,\3,1.5,-0.00000001,0000012]"
+    assert inflate.unused_data == (
+        struct.pack(">fd", 0.1, 0.1234567890123) + b"\x08" + (1763690000000000005).to_bytes(8, "big") + b"\1\xfb"
+    )
+    assert unpack(packed) == payload
+
+
+@pytest.mark.parametrize("numbers", [b"", b"\0", b"\x0a" + bytes(10), b"\4\0\0\0"])
+def test_integers_of_an_impossible_size_are_refused(numbers):
+    with pytest.raises(Malformed):
+        unpack(b"\1" + deflated(b"\3") + numbers)
+
+
+NUMBERS = st.one_of(
+    st.floats(), st.floats(width=32), st.integers(), st.integers(-(2**64), 2**64), st.floats(-10, 10)
+)
+
+
+@settings(max_examples=300)
+@given(st.lists(st.one_of(NUMBERS.map(repr), st.text(alphabet="0123456789.-+eE\1,", max_size=30)), max_size=30))
+def test_any_numbers_come_back_as_they_were_written(tokens):
+    payload = ",".join(tokens).encode()
+    assert unpack(pack(payload) + bytes(9)) == payload
+
+
+@settings(max_examples=300)
+@given(st.binary(max_size=60), st.booleans())
+def test_no_bytes_break_unpacking(noise, has_mode):
+    with suppress(Malformed):
+        unpack(b"\1" + deflated(noise) + noise if has_mode else noise)
 
 
 def test_sizes_tell_little():

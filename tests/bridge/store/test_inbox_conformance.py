@@ -99,10 +99,12 @@ def test_other_bytes_under_a_known_identity_are_a_conflict_and_kept_aside(inbox,
         inbox.done([first.id], T0)
     if fate == "dead":
         inbox.dead_letter([first.id], "cannot be mined", T0)
-    state = inbox.state(first.id, T0)
+    state, held = inbox.state(first.id, T0), inbox.statistics(T0).bytes
     assert inbox.append([other, other], T0 + 1) == [Outcome.CONFLICT] * 2
     assert inbox.append([first], T0 + 2) == [Outcome.DUPLICATE]
+    assert inbox.append([other], T0 + 3) == [Outcome.CONFLICT]
     assert inbox.state(first.id, T0) is state
+    assert inbox.statistics(T0).bytes == held + len(other.ciphertext)
     conflicts = [letter for letter in inbox.dead_letters() if letter.conflict]
     assert [(letter.record, letter.at) for letter in conflicts] == [(other, T0 + 1)]
     assert conflicts[0].reason

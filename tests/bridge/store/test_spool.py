@@ -161,6 +161,7 @@ def test_at_the_bound_the_oldest_goes_and_is_noted(path):
         fill(spool, range(1, 6))
         assert seqs(spool.pending(9)) == [3, 4, 5]
         assert undeclared(spool) == [SeqRange(S1, 1, 2)]
+        assert spool.next_commit() is None  # that is written already
 
 
 def test_bytes_bound_as_well(path):
@@ -193,6 +194,16 @@ def test_control_records_are_never_dropped_and_take_no_room(path):
         spool.append([record(2, S2)], Delivery.CONTROL, 0.0)
         assert [(i.id.stream, i.id.seq) for i in spool.pending(9)] == [(S1, 0), (S2, 0), (S2, 1), (S2, 2)]
         assert undeclared(spool) == [SeqRange(S1, 1, 1)]
+
+
+def test_what_is_dropped_is_not_handed_out_although_that_is_not_written_yet(path):
+    with Spool(path, ROBOT, SpoolLimits(records=2, window=1.0)) as spool:
+        fill(spool, [1, 2])
+        spool.commit(1.0)
+        fill(spool, [3], now=2.0)
+        assert seqs(spool.pending(9)) == [2]
+        spool.commit(3.0)
+        assert seqs(spool.pending(9)) == [3]
 
 
 def test_dropped_while_on_its_way(path):
@@ -427,7 +438,7 @@ class SpoolMachine(RuleBasedStateMachine):
     @rule(limit=st.integers(1, 4))
     def pending(self, limit):
         got = seqs(self.spool.pending(limit))
-        assert not set(got) & (self.handed | self.done)
+        assert not set(got) & (self.handed | self.done | self.gaps())
         self.handed |= set(got)
 
     @rule(data=st.data())

@@ -100,11 +100,13 @@ def test_a_failed_append_leaves_no_trace_of_a_new_stream(small_disk):
     """The numbers given to a robot and a stream in a transaction that failed are not used afterwards."""
     with SqliteInbox(small_disk / "inbox.db") as inbox:
         ballast = fill_up(small_disk)
-        new = [SealedRecord(RecordId(bytes([n]) * 32, b"s" * 16, 0), bytes(20_000)) for n in range(80)]
+        ids = [RecordId(bytes([n]) * 32, b"s" * 16, seq) for n in range(40) for seq in (0, 1)]
+        new = [SealedRecord(id, bytes(20_000)) for id in ids]
         with pytest.raises(StoreError, match="full"):
             inbox.append(new, T0)
         ballast.unlink()
-        assert inbox.append(new[:10], T0) == [Outcome.NEW] * 10
-        robots = {item.record.id.robot for _ in range(10)
-                  for item in inbox.lease("c", limit=1, max_bytes=1, now=T0, ttl=9)}
-        assert robots == {one.id.robot for one in new[:10]}
+        kept = new[9::-1]  # in another order, so that the numbers are others
+        assert inbox.append(kept, T0) == [Outcome.NEW] * 10
+        for robot in {one.id.robot for one in kept}:
+            leased = inbox.lease("c", limit=9, max_bytes=1 << 20, now=T0, ttl=9, robot=robot)
+            assert [item.record.id for item in leased] == sorted(one.id for one in kept if one.id.robot == robot)
