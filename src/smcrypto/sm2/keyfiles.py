@@ -435,6 +435,8 @@ def dump_private(
     _require_form(form)
     if format not in ("pkcs8", "sec1"):
         raise InvalidOption(f"format must be 'pkcs8' or 'sec1', not {format!r}")
+    if prf not in ("sm3", "sha256"):
+        raise InvalidOption(f"prf must be 'sm3' or 'sha256', not {prf!r}")
     # RFC 5915, 3 wants both optional fields always there, inside PKCS#8 too; GmSSL refuses a key without them.
     sec1 = der.sequence(
         der.integer(1),
@@ -464,7 +466,7 @@ def _algorithm() -> bytes:
     return der.sequence(der.oid(_EC_PUBLIC_KEY), der.oid(_SM2))
 
 
-def _encrypted(data: bytes, password: bytes, prf: str, iterations: int) -> bytes:
+def _encrypted(data: bytes, password: bytes, prf: Prf, iterations: int) -> bytes:
     from smcrypto import kdf, sm4
 
     if not password:
@@ -476,11 +478,9 @@ def _encrypted(data: bytes, password: bytes, prf: str, iterations: int) -> bytes
         # No NULL after the name: GmSSL refuses one.
         function = der.sequence(der.oid(_HMAC_SM3))
         key = kdf.pbkdf2_hmac(password, salt, iterations, 16)
-    elif prf == "sha256":
+    else:
         function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
         key = hashlib.pbkdf2_hmac("sha256", password, salt, iterations, 16)
-    else:
-        raise InvalidOption(f"prf must be 'sm3' or 'sha256', not {prf!r}")
     derivation = der.sequence(
         der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function)
     )

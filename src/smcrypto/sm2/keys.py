@@ -336,33 +336,50 @@ class PrivateKey:
         """
         return self._d.to_bytes(self._curve.scalar_bytes, "big")
 
-    def to_pem(self, password: BytesLike | None = None, format: Literal["pkcs8", "sec1"] = "pkcs8") -> bytes:
+    def to_pem(
+        self,
+        password: BytesLike | None = None,
+        format: Literal["pkcs8", "sec1"] = "pkcs8",
+        *,
+        prf: Literal["sm3", "sha256"] = "sm3",
+    ) -> bytes:
         """The key as PEM: secret unless a password encrypts it.
 
         format: "pkcs8" (RFC 5958; label PRIVATE KEY, or ENCRYPTED PRIVATE KEY with a password: PBES2 with
-        SM4-CBC and PBKDF2-HMAC-SM3), or "sec1" (RFC 5915, EC PRIVATE KEY), which takes no password (InvalidOption).
+        SM4-CBC and PBKDF2), or "sec1" (RFC 5915, EC PRIVATE KEY), which takes no password (InvalidOption).
+        prf: of PBKDF2; "sm3" as GmSSL has it, "sha256" for OpenSSL 3.0 and 3.1, which cannot read the former.
 
         >>> PrivateKey.generate().to_pem(b"password").splitlines()[0]
         b'-----BEGIN ENCRYPTED PRIVATE KEY-----'
         """
-        return self._dump(password, format, "pem")
+        return self._dump(password, format, "pem", prf)
 
-    def to_der(self, password: BytesLike | None = None, format: Literal["pkcs8", "sec1"] = "pkcs8") -> bytes:
+    def to_der(
+        self,
+        password: BytesLike | None = None,
+        format: Literal["pkcs8", "sec1"] = "pkcs8",
+        *,
+        prf: Literal["sm3", "sha256"] = "sm3",
+    ) -> bytes:
         """As `to_pem`, as DER.
 
         >>> key = PrivateKey.generate()
         >>> PrivateKey.from_der(key.to_der()) == key
         True
         """
-        return self._dump(password, format, "der")
+        return self._dump(password, format, "der", prf)
 
     def _dump(
-        self, password: BytesLike | None, format: Literal["pkcs8", "sec1"], form: Literal["pem", "der"]
+        self,
+        password: BytesLike | None,
+        format: Literal["pkcs8", "sec1"],
+        form: Literal["pem", "der"],
+        prf: Literal["sm3", "sha256"],
     ) -> bytes:
         from smcrypto.sm2 import keyfiles
 
         return keyfiles.dump_private(
-            self._d, self.public_key._standard_bytes(), _password(password), format, form=form
+            self._d, self.public_key._standard_bytes(), _password(password), format, form=form, prf=prf
         )
 
     def sign(

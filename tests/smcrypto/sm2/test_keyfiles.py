@@ -618,3 +618,15 @@ def test_any_key_comes_back(d: int) -> None:
     assert sm2.PrivateKey.from_der(key.to_der()) == key
     assert sm2.PrivateKey.from_pem(key.to_pem(format="sec1")) == key
     assert sm2.PublicKey.from_der(key.public_key.to_der()) == key.public_key
+
+
+def test_a_key_written_for_older_openssl_is_read_by_it(require: Callable[[str], str], tmp_path: Path) -> None:
+    key = sm2.PrivateKey.generate()
+    (tmp_path / "key.pem").write_bytes(key.to_pem(b"open sesame", prf="sha256"))
+    command = [require("openssl"), "pkey", "-in", str(tmp_path / "key.pem"), "-passin", "pass:open sesame", "-pubout"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    assert sm2.PublicKey.from_pem(done.stdout) == key.public_key
+    with pytest.raises(InvalidOption):
+        key.to_pem(b"open sesame", prf="md5")
+    with pytest.raises(InvalidOption):
+        key.to_pem(prf="md5")
