@@ -138,11 +138,15 @@ class EmbeddedChain:
 
         A call into a contract keeps 1/64 of the gas back (EIP-150), hence the margin for value transfers.
         """
+        used = self.execution_gas(call)
+        margin = 2_300 + used // 64 if call.value else 0
+        return max(used + margin, self._floor_gas(call.data))
+
+    def execution_gas(self, call: Call) -> int:
+        """What a call costs apart from the floor price of its calldata (EIP-7623): the price before Prague."""
         with self._lock:
             transaction, computation = self._try(call, None)
-            used = transaction.intrinsic_gas + computation.get_gas_used()
-            margin = 2_300 + used // 64 if call.value else 0
-            return max(int(used + margin), self._floor_gas(call.data))
+            return int(transaction.intrinsic_gas + computation.get_gas_used())
 
     def send(self, raws: Sequence[bytes]) -> list[bytes | NodeFailure]:
         answers: list[bytes | NodeFailure] = []
@@ -192,6 +196,11 @@ class EmbeddedChain:
             )
             self._accept(transaction.as_signed_transaction(self._faucet).encode())
             self.mine()
+
+    def receipts_of(self, block: int) -> tuple[Receipt, ...]:
+        """All receipts of a block."""
+        with self._lock:
+            return self._blocks[block].receipts
 
     def mine(self, blocks: int = 1) -> None:
         """Mine so many blocks; the first takes what the pool has and the gas limit allows."""

@@ -36,6 +36,7 @@ from rosbridge_eth.ledger.failures import (
 
 T = TypeVar("T")
 MAX_BATCH = 50  # requests in one batch; providers commonly allow 100
+CLOSE_SECONDS = 1.0  # for a node to say goodbye
 MAX_PAUSE = 5.0  # seconds between attempts at most
 FALLBACK_PRIORITY_FEE = 1_000_000_000
 
@@ -105,7 +106,9 @@ class WebSocketTransport:
         with self._lock:
             try:
                 if self._socket is None:
-                    connection = connect(self._url, open_timeout=self._timeout, max_size=None)
+                    connection = connect(
+                        self._url, open_timeout=self._timeout, close_timeout=CLOSE_SECONDS, max_size=None
+                    )
                     self._socket = self._open.enter_context(connection)
                 self._socket.send(body.decode())
                 answer = self._socket.recv(timeout=self._timeout)
