@@ -1,4 +1,4 @@
-"""What every public function does first: take any bytes-like object, refuse all else."""
+"""What every public function does first: take any bytes-like object, refuse all that is of another type."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 else:
     BytesLike = bytes | bytearray | memoryview
 
-__all__ = ["BytesLike", "as_bytes", "as_exact_bytes"]
+__all__ = ["BytesLike", "as_bytes", "as_exact_bytes", "require_int", "require_type"]
 
 
 def as_bytes(value: BytesLike, name: str) -> bytes:
@@ -33,3 +33,16 @@ def as_exact_bytes(value: BytesLike, name: str, length: int) -> bytes:
     if len(data) != length:
         raise InvalidLength(f"{name} must be {length} bytes, not {len(data)}")
     return data
+
+
+def require_int(value: int, name: str) -> int:
+    """`value` itself; TypeError, naming the argument, unless it is an int. True and False are none."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise TypeError(f"{name} must be an int, not {type(value).__name__}")
+    return value
+
+
+def require_type(value: object, kind: type, name: str) -> None:
+    """TypeError, naming the argument, unless `value` is a `kind`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be a {kind.__name__}, not {type(value).__name__}")

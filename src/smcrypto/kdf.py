@@ -11,7 +11,7 @@ import struct
 
 from smcrypto import sm3
 from smcrypto.errors import InvalidLength, InvalidOption
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_int
 
 __all__ = ["hkdf", "pbkdf2_hmac", "sm2_kdf"]
 
@@ -19,12 +19,6 @@ _HASH = sm3.SM3.digest_size
 _SM2_LIMIT = _HASH * (2**32 - 1)
 _HKDF_LIMIT = 255 * _HASH
 _INT_MAX = 2**31 - 1
-
-
-def _checked_int(value: int, name: str) -> int:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"{name} must be an int, not {type(value).__name__}")
-    return value
 
 
 def sm2_kdf(z: BytesLike, length: int) -> bytes:
@@ -38,7 +32,7 @@ def sm2_kdf(z: BytesLike, length: int) -> bytes:
     40
     """
     z = as_bytes(z, "z")
-    if not 0 <= _checked_int(length, "length") < _SM2_LIMIT:
+    if not 0 <= require_int(length, "length") < _SM2_LIMIT:
         raise InvalidLength(f"length must be 0 or more and below 32·(2^32 - 1) bytes, not {length}")
     hashed = sm3._started(z)
     output = []
@@ -57,7 +51,7 @@ def hkdf(key: BytesLike, length: int, *, salt: BytesLike = b"", info: BytesLike 
     otherwise InvalidLength. Source: RFC 5869.
     """
     IKM, salt, info = as_bytes(key, "key"), as_bytes(salt, "salt"), as_bytes(info, "info")
-    if not 0 <= _checked_int(length, "length") <= _HKDF_LIMIT:
+    if not 0 <= require_int(length, "length") <= _HKDF_LIMIT:
         raise InvalidLength(f"length must be 0 ... {_HKDF_LIMIT} bytes, not {length}")
     PRK = sm3.hmac(salt, IKM)
     keyed_inner, keyed_outer = sm3._keyed(PRK)
@@ -82,9 +76,9 @@ def pbkdf2_hmac(password: BytesLike, salt: BytesLike, iterations: int, length: i
     '30530b86537c85ea'
     """
     password, salt = as_bytes(password, "password"), as_bytes(salt, "salt")
-    if not 1 <= _checked_int(iterations, "iterations") <= _INT_MAX:
+    if not 1 <= require_int(iterations, "iterations") <= _INT_MAX:
         raise InvalidOption(f"iterations must be 1 ... 2^31 - 1, not {iterations}")
-    if not 1 <= _checked_int(length, "length") <= _INT_MAX:
+    if not 1 <= require_int(length, "length") <= _INT_MAX:
         raise InvalidLength(f"length must be 1 ... 2^31 - 1 bytes, not {length}")
     if sm3.ENGINE == "openssl":
         return hashlib.pbkdf2_hmac("sm3", password, salt, iterations, length)

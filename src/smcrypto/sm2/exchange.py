@@ -16,7 +16,7 @@ from hmac import compare_digest
 
 from smcrypto import sm3
 from smcrypto.errors import ConfirmationError, InvalidKey, InvalidLength, OutOfOrder
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.kdf import sm2_kdf
 from smcrypto.sm2.curve import Curve, Point, decode_point, encode_point
 from smcrypto.sm2.keys import PrivateKey, PublicKey
@@ -83,10 +83,8 @@ class KeyExchange:
             (peer_public, PublicKey, "peer_public"),
             (own_key if ephemeral_key is None else ephemeral_key, PrivateKey, "ephemeral_key"),
         ):
-            if not isinstance(key, kind):
-                raise TypeError(f"{name} must be a {kind.__name__}, not {type(key).__name__}")
-        if not isinstance(initiator, bool):
-            raise TypeError(f"initiator must be a bool, not {type(initiator).__name__}")
+            require_type(key, kind, name)
+        require_type(initiator, bool, "initiator")
         self._curve = curve = own_key.curve
         if ephemeral_key is None:
             ephemeral_key = PrivateKey.generate(curve)
@@ -115,9 +113,7 @@ class KeyExchange:
         OutOfOrder if it has agreed already.
         """
         data = as_bytes(peer_ephemeral, "peer_ephemeral")
-        if not isinstance(length, int) or isinstance(length, bool):
-            raise TypeError(f"length must be an int, not {type(length).__name__}")
-        if not 1 <= length < 32 * (2**32 - 1):
+        if not 1 <= require_int(length, "length") < 32 * (2**32 - 1):
             raise InvalidLength(f"length must be at least 1 byte and below 32 * (2**32 - 1), not {length}")
         if self._ephemeral_key is None:
             raise OutOfOrder("this exchange has agreed on a key already; every run needs its own")

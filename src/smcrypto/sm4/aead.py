@@ -13,7 +13,7 @@ from __future__ import annotations
 from hmac import compare_digest
 
 from smcrypto.errors import InvalidLength, InvalidTag
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_int
 from smcrypto.sm4.engine import Engine, xor_bytes
 from smcrypto.sm4.ghash import GHASH
 
@@ -28,9 +28,7 @@ _ONE_PASS = 4096  # bytes up to which decryption makes E(K, J_0) and the key str
 
 
 def _checked_tag_length(tag_length: int, allowed: tuple[int, ...]) -> int:
-    if not isinstance(tag_length, int) or isinstance(tag_length, bool):
-        raise TypeError(f"tag_length must be an int, not {type(tag_length).__name__}")
-    if tag_length not in allowed:
+    if require_int(tag_length, "tag_length") not in allowed:
         raise InvalidLength(f"tag_length must be one of {', '.join(map(str, allowed))} bytes, not {tag_length}")
     return tag_length
 

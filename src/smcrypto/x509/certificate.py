@@ -6,7 +6,7 @@ from datetime import datetime
 
 from smcrypto import der, pem, sm2, sm3
 from smcrypto.errors import CertificateError
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_type
 from smcrypto.sm2 import keyfiles
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.names import Name
@@ -196,6 +196,7 @@ class Certificate:
     ) -> None:
         """CertificateError unless `issuer`'s key made this signature. Nothing else is checked: see `verify_chain`."""
         key = issuer.public_key if isinstance(issuer, Certificate) else issuer
+        require_type(key, sm2.PublicKey, "issuer")
         self._signed.verify(key, as_bytes(uid, "uid"), f"the certificate of {self._subject or 'nobody'}")
 
     def fingerprint(self) -> bytes:

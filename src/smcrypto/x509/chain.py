@@ -17,7 +17,7 @@ from typing import Final, Literal
 
 from smcrypto import sm2
 from smcrypto.errors import CertificateError, InvalidOption
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_type
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
 from smcrypto.x509.names import Name
@@ -66,16 +66,19 @@ def verify_chain(
     """
     if revocation not in ("leaf", "every"):
         raise InvalidOption(f"revocation must be 'leaf' or 'every', not {revocation!r}")
-    for certificate in (leaf, *(intermediates := tuple(intermediates)), *(roots := tuple(roots))):
-        if not isinstance(certificate, Certificate):
-            raise TypeError(f"a Certificate is needed, not {type(certificate).__name__}")
+    intermediates, roots, crls = tuple(intermediates), tuple(roots), tuple(crls)
+    for certificate, name in ((leaf, "leaf"), *((c, "each of intermediates") for c in intermediates),
+                              *((c, "each of roots") for c in roots)):  # fmt: skip
+        require_type(certificate, Certificate, name)
+    for crl in crls:
+        require_type(crl, CertificateRevocationList, "each of crls")
     search = _Search(
         intermediates,
         roots,
         instant(at, "at"),
         as_bytes(uid, "uid"),
         _names(extended_key_usage),
-        tuple(crls),
+        crls,
         revocation == "every",
     )
     usages = ext.usage_names(_names(key_usage))

@@ -14,6 +14,7 @@ from typing import Final
 
 from smcrypto import der, sm3
 from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
+from smcrypto.inputs import require_int
 from smcrypto.x509.names import Name
 
 __all__ = [
@@ -138,9 +139,7 @@ def read_basic_constraints(value: bytes) -> BasicConstraints:
 
 
 def basic_constraints(ca: bool, path_length: int | None) -> Extension:
-    if path_length is not None and (isinstance(path_length, bool) or not isinstance(path_length, int)):
-        raise TypeError(f"path_length must be an int, not {type(path_length).__name__}")
-    if path_length is not None and (not ca or path_length < 0):
+    if path_length is not None and (require_int(path_length, "path_length") < 0 or not ca):
         raise InvalidOption("a path length is a number from 0 on, and for a CA only")
     parts = ([der.boolean(True)] if ca else []) + ([] if path_length is None else [der.integer(path_length)])
     return Extension(BASIC_CONSTRAINTS, True, der.sequence(*parts))

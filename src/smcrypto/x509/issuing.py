@@ -13,7 +13,7 @@ from typing import Final
 
 from smcrypto import der, sm2
 from smcrypto.errors import InvalidKey, InvalidOption
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
 from smcrypto.x509.names import Name
@@ -60,14 +60,15 @@ def issue(
     InvalidKey: `ca_key` is not the key of `ca_certificate`. Naive times and values that cannot be
     written are InvalidOption.
     """
-    _require(csr, CertificateSigningRequest, "csr")
-    _require(ca_certificate, Certificate, "ca_certificate")
-    _require(ca_key, sm2.PrivateKey, "ca_key")
+    require_type(csr, CertificateSigningRequest, "csr")
+    require_type(ca_certificate, Certificate, "ca_certificate")
+    require_type(ca_key, sm2.PrivateKey, "ca_key")
     if ca_key.public_key != ca_certificate.public_key:
         raise InvalidKey("ca_key is not the key of ca_certificate")
     signer_uid = as_bytes(uid, "uid")
+    requester_uid = signer_uid if request_uid is None else as_bytes(request_uid, "request_uid")
     if not csr.verified:
-        csr.verify(uid=signer_uid if request_uid is None else request_uid)
+        csr.verify(uid=requester_uid)
     return _certificate(
         issuer=ca_certificate.subject,
         authority=ca_certificate.subject_key_identifier,
@@ -101,7 +102,7 @@ def self_signed(
     uid: BytesLike = sm2.DEFAULT_UID,
 ) -> Certificate:
     """A certificate that `key` issues to itself: the root of a CA. Arguments and errors as of `issue`."""
-    _require(key, sm2.PrivateKey, "key")
+    require_type(key, sm2.PrivateKey, "key")
     name = Name.build(subject)
     return _certificate(
         issuer=name,
@@ -161,11 +162,6 @@ def _certificate(
     return Certificate.from_der(sign(body, key, uid))
 
 
-def _require(value: object, kind: type, name: str) -> None:
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}, not {type(value).__name__}")
-
-
 def _usages(names: Iterable[str] | None, ca: bool) -> Iterable[str]:
     if names is None:
         return CA_KEY_USAGE if ca else SIGNING_KEY_USAGE
@@ -182,8 +178,6 @@ def _validity(not_before: datetime, not_after: datetime) -> bytes:
 def _serial(number: int | None) -> int:
     if number is None:
         return secrets.randbelow(_MAX_SERIAL) + 1
-    if isinstance(number, bool) or not isinstance(number, int):
-        raise TypeError(f"serial_number must be an int, not {type(number).__name__}")
-    if not 1 <= number <= _MAX_SERIAL:
+    if not 1 <= require_int(number, "serial_number") <= _MAX_SERIAL:
         raise InvalidOption("serial_number must be positive and fit 20 bytes (RFC 5280, 4.1.2.2)")
     return number

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from smcrypto import der, pem, sm2
 from smcrypto.errors import CertificateError
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_type
 from smcrypto.sm2 import keyfiles
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.names import Name
@@ -50,8 +50,7 @@ class CertificateSigningRequest:
 
         InvalidOption: a name, usage or alternative name that cannot be written.
         """
-        if not isinstance(key, sm2.PrivateKey):
-            raise TypeError(f"key must be an sm2.PrivateKey, not {type(key).__name__}")
+        require_type(key, sm2.PrivateKey, "key")
         name = Name.build(subject)
         wanted = ext.requested(name, subject_alt_names, key_usage, extended_key_usage)
         attributes = []

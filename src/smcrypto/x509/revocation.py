@@ -15,7 +15,7 @@ from typing import Final
 
 from smcrypto import der, pem, sm2
 from smcrypto.errors import CertificateError, InvalidKey, InvalidOption
-from smcrypto.inputs import BytesLike, as_bytes
+from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
 from smcrypto.x509.names import Name
@@ -94,16 +94,18 @@ class CertificateRevocationList:
         InvalidKey: `ca_key` is not the key of `ca_certificate`. InvalidOption:
         an entry twice, an unknown reason, a negative number, naive or reversed times.
         """
+        require_type(ca_certificate, Certificate, "ca_certificate")
+        require_type(ca_key, sm2.PrivateKey, "ca_key")
         if ca_key.public_key != ca_certificate.public_key:
             raise InvalidKey("ca_key is not the key of ca_certificate")
         begin, end = instant(this_update, "this_update"), instant(next_update, "next_update")
         if end < begin:
             raise InvalidOption("next_update lies before this_update")
-        if isinstance(number, bool) or not isinstance(number, int):
-            raise TypeError(f"number must be an int, not {type(number).__name__}")
-        if not 0 <= number < 2**159:
+        if not 0 <= require_int(number, "number") < 2**159:
             raise InvalidOption("the list's number must not be negative and must fit 20 bytes (RFC 5280, 5.2.3)")
         entries = tuple(revoked)
+        for entry in entries:
+            require_type(entry, RevokedCertificate, "what is revoked")
         if len({entry.serial_number for entry in entries}) != len(entries):
             raise InvalidOption("a serial number is revoked twice")
         extensions = [ext.Extension(_CRL_NUMBER, False, der.integer(number))]
@@ -221,6 +223,7 @@ class CertificateRevocationList:
 
     def verify(self, issuer: Certificate, *, uid: BytesLike = sm2.DEFAULT_UID) -> None:
         """CertificateError unless `issuer` may sign revocation lists and signed this one under `uid`."""
+        require_type(issuer, Certificate, "issuer")
         what = f"the revocation list of {self._issuer}"
         if issuer.subject != self._issuer:
             raise CertificateError(f"{what} is not from {issuer.subject}")
