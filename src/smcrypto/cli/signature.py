@@ -6,11 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from smcrypto import sm2, sm3
+from smcrypto import sm2
 from smcrypto.cli.files import add_input, add_output, chunks, write_output
 from smcrypto.cli.keys import add_key, add_public, load_private, load_public
 from smcrypto.errors import InvalidSignature
-from smcrypto.sm2.signature import z_value
 
 __all__ = ["add_parser"]
 
@@ -41,7 +40,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 def _digest(public_key: sm2.PublicKey, options: argparse.Namespace) -> bytes:
     """e = SM3(Z_A || M), GB/T 32918.2, 6.1 A1 and A2, without holding M in memory."""
-    state = sm3.SM3(z_value(public_key.curve, public_key.point, options.uid.encode()))
+    state = public_key.hasher(uid=options.uid.encode())
     for chunk in chunks(options.file):
         state.update(chunk)
     return state.digest()
