@@ -51,6 +51,8 @@ def _prepare(
     try:
         if exclusive:
             db.execute("PRAGMA locking_mode = EXCLUSIVE")
+        if path.stat().st_size == 0:
+            db.execute("PRAGMA auto_vacuum = INCREMENTAL")  # possible only before there is anything
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
         db.execute("PRAGMA foreign_keys = ON")

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum
@@ -88,6 +88,8 @@ class _Row:
 
 
 _MAX_DECLARED: Final = 1024  # ranges; even if each is of a stream of its own they fit one record
+_RESERVE: Final = 512 << 10  # bytes of a file beside the spool that is given up when the disk is full
+_REMOVED_AT_ONCE: Final = 32  # records, when the disk is full; each changes a page or two of 4 KiB
 _RETRY: Final = 1.0  # seconds between attempts to write while the disk refuses
 
 
@@ -113,6 +115,9 @@ class Spool:
         self._lane_of: dict[int, int] = {}  # by place
         self._superseded = self._dropped = self._refused = 0
         self._closed = False
+        self._reserve_path = self._path.with_name(self._path.name + ".reserve")
+        with suppress(OSError):  # if there is none, or no such folder, the next line says so
+            self._reserve_path.unlink()
         self._db = open_database(
             self._path, application=sql.SPOOL_APPLICATION, schema=sql.SPOOL_SCHEMA, what="spool", exclusive=True
         )
@@ -121,6 +126,7 @@ class Spool:
         except BaseException:
             self._db.close()
             raise
+        self._has_room()
 
     def _load(self) -> tuple[RecordId | None, int, int, _Gaps]:
         with self._translated():
@@ -365,48 +371,80 @@ class Spool:
                 self._due = None if self._trouble is None else now + _RETRY
 
     def _write(self) -> None:
-        rows: list[_Row] = []
+        if self._try_to_write():
+            return
+        with self._translated():
+            self._drain()  # that may have made the room
+        self._try_to_write()
+
+    def _try_to_write(self) -> bool:
+        """False if the disk is full; `_trouble` says whether, and why else, nothing was written."""
         try:
-            with transaction(self._db):
-                for id, waiting in self._waiting.items():
-                    ciphertext = waiting.record.ciphertext
-                    place = self._db.execute(
-                        sql.SPOOL_KEEP, (waiting.delivery, id.stream, _seq(id.seq), ciphertext)
-                    ).lastrowid
-                    rows.append(_Row(place or 0, waiting.delivery, len(ciphertext)))
-                self._db.executemany(sql.SPOOL_REMOVE, [(place,) for place in self._removed])
-                removed, written = self._gaps.changes()
-                self._db.executemany(sql.UNDECLARED_REMOVE, [(stream, _seq(first)) for stream, first in removed])
-                self._db.executemany(
-                    sql.UNDECLARED_WRITE, [(stream, _seq(first), _seq(last)) for stream, first, last in written]
-                )
-                if self._last is not None:
-                    self._db.execute(sql.SPOOL_LAST, (self._last.stream, _seq(self._last.seq)))
+            if self._has_room():
+                self._store(self._waiting, list(self._removed), self._last)
+                self._waiting.clear()
+                self._trouble = None
+                return True
         except sqlite3.Error as error:
             if is_damage(error):
                 raise self._damage(error) from None
-            if primary_code(error) == sqlite3.SQLITE_FULL:
-                self._shrink()
-            self._trouble = (
-                f"the disk of the spool {self._path} is full; make room, what was kept before is safe"
-                if primary_code(error) == sqlite3.SQLITE_FULL
-                else f"the spool {self._path} cannot be written ({error}); what was kept before is safe"
-            )
-            return
-        for waiting, row in zip(self._waiting.values(), rows, strict=True):
-            id = waiting.record.id
-            if waiting.lane is not None and self._lanes.get(waiting.lane) == (id, None):
-                self._lanes[waiting.lane] = id, row
-                self._lane_of[row.place] = waiting.lane
-        self._waiting.clear()
-        self._removed.clear()
-        self._gaps.changed.clear()
-        self._trouble = None
+            if primary_code(error) != sqlite3.SQLITE_FULL:
+                self._trouble = f"the spool {self._path} cannot be written ({error}); what was kept before is safe"
+                return True
+        self._trouble = f"the disk of the spool {self._path} is full; make room, what was kept before is safe"
+        return False
 
-    def _shrink(self) -> None:
-        """Move the write-ahead log into the file, if there is room for that: the log is then written from its start."""
-        with suppress(sqlite3.OperationalError):  # no room for that either: all is as it was
+    def _store(self, waiting: Mapping[RecordId, _Waiting], removed: list[int], last: RecordId | None) -> None:
+        """One transaction: these records and removals, and all gaps. What is in memory follows once it is done."""
+        rows: list[_Row] = []
+        with transaction(self._db):
+            for id, one in waiting.items():
+                ciphertext = one.record.ciphertext
+                place = self._db.execute(
+                    sql.SPOOL_KEEP, (one.delivery, id.stream, _seq(id.seq), ciphertext)
+                ).lastrowid
+                rows.append(_Row(place or 0, one.delivery, len(ciphertext)))
+            self._db.executemany(sql.SPOOL_REMOVE, [(place,) for place in removed])
+            gone, written = self._gaps.changes()
+            self._db.executemany(sql.UNDECLARED_REMOVE, [(stream, _seq(first)) for stream, first in gone])
+            self._db.executemany(
+                sql.UNDECLARED_WRITE, [(stream, _seq(first), _seq(last)) for stream, first, last in written]
+            )
+            if last is not None:
+                self._db.execute(sql.SPOOL_LAST, (last.stream, _seq(last.seq)))
+        for (id, one), row in zip(waiting.items(), rows, strict=True):
+            if one.lane is not None and self._lanes.get(one.lane) == (id, None):
+                self._lanes[one.lane] = id, row
+                self._lane_of[row.place] = one.lane
+        self._removed.difference_update(removed)
+        self._gaps.changed.clear()
+
+    def _has_room(self) -> bool:
+        """Whether the reserve is there, or can be made: as long as not, what room there is serves for removing."""
+        if self._reserve_path.exists():
+            return True
+        try:
+            self._reserve_path.write_bytes(bytes(_RESERVE))
+        except OSError:
+            self._reserve_path.unlink(missing_ok=True)
+            return False
+        return True
+
+    def _drain(self) -> None:
+        """On a full disk, let go at least of what was acknowledged, so that there is room for what is new.
+
+        Even that needs some: the log takes a copy of every changed page until it is moved into the file. The
+        reserve is given up for it, and little is removed at a time.
+        """
+        self._reserve_path.unlink(missing_ok=True)
+        with suppress(sqlite3.OperationalError):  # still no room: all is as it was, and is tried again
             self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            places = sorted(self._removed)
+            for start in range(0, max(len(places), 1), _REMOVED_AT_ONCE):  # once, if only for the gaps
+                # The records in memory are not written, so the newest one written stays what it was.
+                self._store({}, places[start : start + _REMOVED_AT_ONCE], None)
+                self._db.execute(f"PRAGMA incremental_vacuum({2 * _REMOVED_AT_ONCE})").fetchall()
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def _damage(self, error: sqlite3.Error) -> StoreError:
         self._closed = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import sqlite3
 import stat
 import subprocess
@@ -324,7 +325,7 @@ def test_a_full_disk_takes_nothing_new_loses_nothing_old_and_recovers(small_disk
         fill(spool, range(20))
         ballast = fill_up(small_disk)
         refused = []
-        for seq in range(20, 500):
+        for seq in range(20, 5000):
             try:
                 fill(spool, [seq], now=float(seq))
             except SpoolFull as error:
@@ -332,18 +333,49 @@ def test_a_full_disk_takes_nothing_new_loses_nothing_old_and_recovers(small_disk
                 refused.append(seq)
         assert refused
         assert "make room" in spool.statistics.trouble
-        kept = [n for n in range(500) if n not in refused]
-        assert set(seqs(spool.pending(999))) <= set(kept)
+        kept = [n for n in range(5000) if n not in refused]
+        assert set(seqs(spool.pending(9999))) <= set(kept)
         ballast.unlink()
-        spool.commit(1000.0)
+        spool.commit(9000.0)
         assert spool.statistics.trouble is None
         spool.returned()
-        assert seqs(spool.pending(999)) == kept
+        assert seqs(spool.pending(9999)) == kept
         assert [n for part in undeclared(spool) for n in range(part.first, part.last + 1)] == refused
-        fill(spool, [500], now=1001.0)
-        assert seqs(spool.pending(9)) == [500]
-        assert spool.last == record(500).id
-        spool.acknowledged([record(n).id for n in range(400)], 1002.0)
+        fill(spool, [5000], now=9001.0)
+        assert seqs(spool.pending(9)) == [5000]
+        assert spool.last == record(5000).id
+
+
+@pytest.mark.parametrize("at_once", [9, 100, 9999])
+def test_a_disk_that_the_spool_itself_filled_is_drained_by_acknowledgements(small_disk, at_once):
+    """Removing takes room as well, of which there is none; nobody helps."""
+    with Spool(small_disk / "spool.db", ROBOT, SpoolLimits(group=1, unwritten=20)) as spool:
+        with pytest.raises(SpoolFull):
+            fill(spool, range(1, 5000))
+        full_at = spool.last.seq
+        now = 0.0
+        while sent := spool.pending(at_once):
+            now += 5
+            spool.acknowledged([item.id for item in sent], now)
+            spool.commit(now + 2)
+        assert spool.statistics.trouble is None
+        assert undeclared(spool) == [SeqRange(S1, full_at, full_at)]
+        assert spool.statistics.records == 0
+        fill(spool, [full_at + 1], now=now)
+        assert seqs(spool.pending(9)) == [full_at + 1]
+
+
+def test_a_crash_on_a_full_disk_forgets_what_was_only_in_memory(small_disk, path):
+    """The newest record that the file knows is one that it has: those in memory were never sent."""
+    with Spool(small_disk / "spool.db", ROBOT, SpoolLimits(group=1, unwritten=20)) as spool:
+        with pytest.raises(SpoolFull):
+            fill(spool, range(1, 5000))
+        shutil.copytree(small_disk, path.parent / "as the crash left it")
+        kept, full_at = seqs(spool.pending(9999)), spool.last.seq
+        spool.acknowledged([record(n).id for n in kept], 100.0)
+    with Spool(path.parent / "as the crash left it" / "spool.db", ROBOT) as spool:
+        assert seqs(spool.pending(9999)) == kept
+        assert spool.last.seq == kept[-1] == full_at - 21
 
 
 # --- crashes
