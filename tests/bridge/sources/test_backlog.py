@@ -1,0 +1,84 @@
+"""What a live source keeps for a robot that is slow: order, bounds, whom a flood costs its messages."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from rosbridge_eth.capture import RawMessage, Wire, decoder_for
+from rosbridge_eth.sources.backlog import OVERHEAD, Backlog
+
+DECODER = decoder_for(Wire.CDR, "std_msgs/msg/String", "string data")
+
+
+def message(topic: str, number: int, size: int = 10) -> RawMessage:
+    return RawMessage(topic, "std_msgs/msg/String", number, bytes(size), DECODER)
+
+
+def drain(backlog: Backlog) -> list[tuple[str, int]]:
+    found = []
+    while (taken := backlog.take(0)) is not None:
+        found.append((taken.topic, taken.received_ns))
+    return found
+
+
+def test_order_is_that_of_arrival_across_topics():
+    backlog = Backlog()
+    sent = [(f"/{number % 3}", number) for number in range(100)]
+    for topic, number in sent:
+        backlog.put(message(topic, number))
+    assert drain(backlog) == sent
+    assert backlog.dropped == {}
+
+
+def test_a_flood_costs_its_own_topic_and_the_newest_stay(caplog):
+    backlog = Backlog(messages=10)
+    backlog.put(message("/odom", 0))
+    for number in range(1000):
+        backlog.put(message("/camera", number, 1000))
+        backlog.put(message("/odom", number + 1)) if number in (300, 600) else None
+    kept = drain(backlog)
+    assert [number for topic, number in kept if topic == "/odom"] == [0, 301, 601]
+    assert [number for topic, number in kept if topic == "/camera"] == list(range(993, 1000))
+    assert backlog.dropped == {"/camera": 993}
+    assert len(caplog.records) == 1
+    assert "/camera" in caplog.text
+
+
+@pytest.mark.parametrize("size", [1, 1000, 5000])
+def test_bytes_are_bounded(size):
+    limit = 20_000
+    backlog = Backlog(size=limit)
+    for number in range(100):
+        backlog.put(message("/a", number, size))
+    kept = drain(backlog)
+    assert len(kept) == min(100, limit // (size + OVERHEAD))
+    assert kept[-1] == ("/a", 99)
+    assert backlog.dropped.get("/a", 0) == 100 - len(kept)
+
+
+def test_a_message_above_the_bound_does_not_cost_the_others():
+    backlog = Backlog(size=10_000)
+    backlog.put(message("/odom", 1))
+    backlog.put(message("/map", 2, 10_001))
+    assert drain(backlog) == [("/odom", 1)]
+    assert backlog.dropped == {"/map": 1}
+
+
+def test_closing_ends_a_wait_and_keeps_what_was_received():
+    backlog = Backlog()
+    backlog.put(message("/a", 1))
+    found: list[RawMessage | None] = []
+
+    def take_two() -> None:
+        found.extend((backlog.take(60), backlog.take(60)))
+
+    waiting = threading.Thread(target=take_two)
+    waiting.start()
+    backlog.close()
+    waiting.join(10)
+    assert not waiting.is_alive()
+    assert [taken and taken.received_ns for taken in found] == [1, None]
+    backlog.put(message("/a", 2))
+    assert drain(backlog) == []
