@@ -21,8 +21,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = Path(smcrypto.__file__).parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 FORBIDDEN = {"ctypes", "_ctypes", "cffi", "subprocess", "multiprocessing", "numpy", "random"}
-# Unrolled rounds are generated, from text in the same file, at import.
-GENERATED = {"_sm3_compression.py", "sm4/tables.py"}
+# Code generated at import, from text in the same file: unrolled rounds, a circuit with its registers reused.
+GENERATED = {"_sm3_compression.py", "sm4/bitslice.py", "sm4/tables.py"}
 # Third-party modules, imported where they are needed and nowhere else: AES and 3DES of others' key files; pictures.
 OPTIONAL = {"sm2/keyfiles.py": {"cryptography"}, "bench.py": {"matplotlib"}}
 
