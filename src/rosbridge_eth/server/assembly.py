@@ -21,7 +21,7 @@ from rosbridge_eth.ledger import Chain, Contract
 from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.ledger.batching import Limits
 from rosbridge_eth.ledger.journal import Binding, Journal
-from rosbridge_eth.ledger.submitter import Settings, Submitter
+from rosbridge_eth.ledger.submitter import BatchTiming, Settings, Submitter
 from rosbridge_eth.protocol import Registration
 from rosbridge_eth.records import robot_id
 from rosbridge_eth.registry import Registry
@@ -49,10 +49,15 @@ def open_chain(config: ServerConfig) -> Chain:
 
 
 def open_inbox(config: ServerConfig, home: OperatorHome) -> Inbox:
-    """The configured inbox."""
-    if config.store.url != "sqlite":
-        raise ConfigError(f"[store] url: this version keeps its inbox in \"sqlite\", not in {config.store.url!r}")
-    return SqliteInbox(home.inbox, InboxLimits(config.store.max_records, config.store.max_size))
+    """The configured inbox. In a Redis it is bound to the deployed contract, so that servers of others can share it."""
+    limits = InboxLimits(config.store.max_records, config.store.max_size)
+    if config.store.url == "sqlite":
+        return SqliteInbox(home.inbox, limits)
+    from rosbridge_eth.store.redis_inbox import RedisInbox  # a client that a server with SQLite need not load
+
+    deployment = home.deployment()
+    binding = f"chain {deployment.chain_id}, genesis {deployment.genesis}, contract {deployment.contract}"
+    return RedisInbox(config.store.url, binding, limits)
 
 
 def binding_of(deployment: Deployment) -> Binding:
@@ -170,8 +175,9 @@ def open_submission(
     inbox: Inbox,
     registry: Registry,
     keys: Keyring,
+    on_confirmed: Callable[[BatchTiming], None] = lambda timing: None,
 ) -> Submission:
-    """The submitter's process; `holder` in its leases is this process."""
+    """The submitter's process; `holder` in its leases is this process. on_confirmed: is given each confirmed batch."""
     settings = submitter_settings(config)
     holder = f"{socket.gethostname()}:{os.getpid()}"
     submitter = Submitter(
@@ -191,4 +197,5 @@ def open_submission(
         holder=holder,
         keep_batches=config.chain.keep,
         prune=journal.prune,
+        on_confirmed=on_confirmed,
     )

@@ -1,4 +1,7 @@
-"""Where records rest: the robot's spool until the server has them, the server's inbox until the ledger has them."""
+"""Where records rest: the robot's spool until the server has them, the server's inbox until the ledger has them.
+
+`redis_inbox.RedisInbox` is imported where it is used: a robot has no need of a Redis client.
+"""
 
 from rosbridge_eth.store.inbox import (
     DeadLetter,

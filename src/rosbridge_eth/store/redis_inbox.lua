@@ -6,9 +6,10 @@ Keys. All begin with KEYS[1] ("rosbridge-eth:<contract>:"), so operators can sha
   meta           hash    format, binding (chain and contract), records and bytes (held, dead letters included),
                          streams and turns (counters)
   records        Stream  the records to be written, in the order of arrival:
-                           t robot, s stream, q seq (8 bytes, big-endian), a arrived, c ciphertext
+                           t ROBOT, s stream, q seq (8 bytes, big-endian), a arrived, c ciphertext,
+                           d blake2b-128 of the ciphertext
                          Its consumer group "ledger" lists what is given out (XPENDING): to whom, how often.
-  streams        hash    robot and stream -> the stream's number (8 bytes), counted as they first arrive
+  streams        hash    ROBOT and stream -> the stream's number (8 bytes), counted as they first arrive
   queue:ROBOT    zset    the robot's records in the order they are given out; all scores are 0
                          member = PLACE = stream's number 8, seq 8, id of the entry in `records`
   lease:ROBOT    zset    PLACE -> end of its lease, seconds
@@ -16,7 +17,7 @@ Keys. All begin with KEYS[1] ("rosbridge-eth:<contract>:"), so operators can sha
   line           zset    robots that have records -> when it was last their turn
   finished:NNSS  hash    identities that are finished with, 128 to a hash so that Redis packs them closely
                          (stream's number 8, seq without its last 7 bits 8): last byte of seq -> "1" done or "2" dead,
-                         and blake2b-128 of the ciphertext, to know it again
+                         and d, to know the ciphertext again
   done           Stream  n (stream's number, seq), a (when): the done identities in the order they are forgotten
   dead           Stream  dead letters: t s q c as above, x (1: conflict), r reason, a when; entry 0-n is the n-th
   conflicts      set     stream's number, seq, digest of every conflict in `dead`
@@ -28,8 +29,8 @@ is the server's idle time, which no test can set.
 
 Numbers that are not small integers pass as text: Lua prints 14 digits of a float.
 
-At `maxmemory` Redis refuses a script's first write if it takes memory, and only the first. So `append` and `lease`
-begin with one that does, and change nothing then; `done` begins with one that frees, and goes through.
+At `maxmemory` Redis refuses a script's first write if it takes memory, and looks at no other. So `append` begins with
+one that does, and is refused whole; `lease` and `finish` begin with one that frees, and go through: a full Redis drains.
 ]]
 local P = KEYS[1]
 local META, RECORDS, STREAMS, LINE = P .. 'meta', P .. 'records', P .. 'streams', P .. 'line'
@@ -38,18 +39,19 @@ local QUEUE, LEASE, FINISHED = P .. 'queue:', P .. 'lease:', P .. 'finished:'
 local GROUP, NOBODY = 'ledger', '(released)'
 local call = redis.call
 
-local function hex(robot)
-  return (robot:gsub('.', function(c) return string.format('%02x', string.byte(c)) end))
-end
-
 -- The PLACE of a record to be written, or nil. name: stream's number and seq.
 local function find(robot, name)
   return call('ZRANGEBYLEX', QUEUE .. robot, '[' .. name, '[' .. name .. '\255', 'LIMIT', 0, 1)[1]
 end
 
+-- The entry of `records` that a PLACE names.
+local function id_in(place)
+  return place:sub(17)
+end
+
 -- The fields of an entry of `records`, as a table.
-local function read(place)
-  local entry = call('XRANGE', RECORDS, place:sub(17), place:sub(17))[1]
+local function read(id)
+  local entry = call('XRANGE', RECORDS, id, id)[1]
   if not entry then error('DAMAGED the stream lacks an entry that the queue names') end
   local fields, flat = {}, entry[2]
   for i = 1, #flat, 2 do fields[flat[i]] = flat[i + 1] end
@@ -73,29 +75,28 @@ function operations.open(binding)
   return call('HMGET', META, 'format', 'binding')
 end
 
--- append now max_records max_bytes {robot stream seq digest ciphertext}: a letter for each; see redis_inbox.py
+-- append now max_records max_bytes {ROBOT stream seq digest ciphertext}: a letter for each; see redis_inbox.py
 function operations.append(now, max_records, max_bytes)
   local held = call('HMGET', META, 'records', 'bytes')
   local records, bytes = tonumber(held[1]), tonumber(held[2])
   max_records, max_bytes = tonumber(max_records), tonumber(max_bytes)
   local outcomes = {}
   for i = 5, #ARGV, 5 do
-    local tk, stream, seq, digest, ciphertext = ARGV[i], ARGV[i + 1], ARGV[i + 2], ARGV[i + 3], ARGV[i + 4]
-    local robot = hex(tk)
-    local number = call('HGET', STREAMS, tk .. stream)
+    local robot, stream, seq, digest, ciphertext = unpack(ARGV, i, i + 4)
+    local number = call('HGET', STREAMS, robot .. stream)
     local place, finished = nil, nil
     if number then
       place = find(robot, number .. seq)
       if not place then finished = call('HGET', note(number .. seq)) end
     end
-    local same = (place and read(place).c == ciphertext) or (finished and finished:sub(2) == digest)
+    local same = (place and read(id_in(place)).c == ciphertext) or (finished and finished:sub(2) == digest)
     if same then
       outcomes[#outcomes + 1] = 'D'
     elseif records + 1 > max_records or bytes + #ciphertext > max_bytes then
       outcomes[#outcomes + 1] = 'F'
     elseif place or finished then
       if call('SADD', CONFLICTS, number .. seq .. digest) == 1 then
-        call('XADD', DEAD, '0-' .. (call('XLEN', DEAD) + 1), 't', tk, 's', stream, 'q', seq, 'x', 1,
+        call('XADD', DEAD, '0-' .. (call('XLEN', DEAD) + 1), 't', robot, 's', stream, 'q', seq, 'x', 1,
           'r', 'this identity is taken by other bytes', 'a', now, 'c', ciphertext)
         records, bytes = records + 1, bytes + #ciphertext
       end
@@ -103,9 +104,9 @@ function operations.append(now, max_records, max_bytes)
     else
       if not number then
         number = struct.pack('>I8', call('HINCRBY', META, 'streams', 1))
-        call('HSET', STREAMS, tk .. stream, number)
+        call('HSET', STREAMS, robot .. stream, number)
       end
-      local id = call('XADD', RECORDS, '*', 't', tk, 's', stream, 'q', seq, 'a', now, 'c', ciphertext)
+      local id = call('XADD', RECORDS, '*', 't', robot, 's', stream, 'q', seq, 'a', now, 'd', digest, 'c', ciphertext)
       if call('ZADD', QUEUE .. robot, 0, number .. seq .. id) == 1 and not call('ZSCORE', LINE, robot) then
         call('ZADD', LINE, call('HINCRBY', META, 'turns', 1), robot)
       end
@@ -125,7 +126,7 @@ local function open_to(robot, consumer, now)
   return out < call('ZCARD', QUEUE .. robot) and (out == 0 or call('HGET', HOLDER, robot) == consumer)
 end
 
--- lease consumer now until limit max_bytes robot|"": {tk {stream seq arrived attempts ciphertext} ...} or {}
+-- lease consumer now until limit max_bytes ROBOT|"": {ROBOT {stream seq arrived attempts ciphertext} ...} or {}
 function operations.lease(consumer, now, till, limit, max_bytes, asked)
   local robot
   for _, candidate in ipairs(asked ~= '' and {asked} or call('ZRANGE', LINE, 0, -1)) do
@@ -135,8 +136,9 @@ function operations.lease(consumer, now, till, limit, max_bytes, asked)
     end
   end
   if not robot then return {} end
+  call('ZREMRANGEBYSCORE', LEASE .. robot, '-inf', now)
   local out = {}
-  for _, place in ipairs(call('ZRANGEBYSCORE', LEASE .. robot, '(' .. now, '+inf')) do out[place] = true end
+  for _, place in ipairs(call('ZRANGE', LEASE .. robot, 0, -1)) do out[place] = true end
   limit, max_bytes = tonumber(limit), tonumber(max_bytes)
   local given, places, total, from, full = {}, {}, 0, 0, false
   while not full do
@@ -145,14 +147,14 @@ function operations.lease(consumer, now, till, limit, max_bytes, asked)
     from = from + #page
     for _, place in ipairs(page) do
       if not out[place] then
-        local fields = #places < limit and read(place)
+        local fields = #places < limit and read(id_in(place))
         if not fields or (#places > 0 and total + #fields.c > max_bytes) then
           full = true
           break
         end
         total = total + #fields.c
         if #places == 0 then given[1] = fields.t end
-        local before = call('XPENDING', RECORDS, GROUP, place:sub(17), place:sub(17), 1)[1]
+        local before = call('XPENDING', RECORDS, GROUP, id_in(place), id_in(place), 1)[1]
         given[#given + 1] = {fields.s, fields.q, fields.a, (before and before[4] or 0) + 1, fields.c}
         places[#places + 1] = place
       end
@@ -162,34 +164,34 @@ function operations.lease(consumer, now, till, limit, max_bytes, asked)
   call('HSET', HOLDER, robot, consumer)
   for n, place in ipairs(places) do
     call('ZADD', LEASE .. robot, till, place)
-    call('XCLAIM', RECORDS, GROUP, consumer, 0, place:sub(17), 'RETRYCOUNT', given[n + 1][4], 'FORCE', 'JUSTID')
+    call('XCLAIM', RECORDS, GROUP, consumer, 0, id_in(place), 'RETRYCOUNT', given[n + 1][4], 'FORCE', 'JUSTID')
   end
   return given
 end
 
--- release consumer {robot stream seq}. It keeps count: the entry stays pending, but nobody's.
+-- release consumer {ROBOT stream seq}. It keeps count: the entry stays pending, but nobody's.
 function operations.release(consumer)
   for i = 3, #ARGV, 3 do
-    local robot = hex(ARGV[i])
-    local number = call('HGET', STREAMS, ARGV[i] .. ARGV[i + 1])
-    local place = number and call('HGET', HOLDER, robot) == consumer and find(robot, number .. ARGV[i + 2])
+    local robot, stream, seq = unpack(ARGV, i, i + 2)
+    local number = call('HGET', STREAMS, robot .. stream)
+    local place = number and call('HGET', HOLDER, robot) == consumer and find(robot, number .. seq)
     if place and call('ZREM', LEASE .. robot, place) == 1 then
-      call('XCLAIM', RECORDS, GROUP, NOBODY, 0, place:sub(17), 'JUSTID')
+      call('XCLAIM', RECORDS, GROUP, NOBODY, 0, id_in(place), 'JUSTID')
     end
   end
 end
 
--- finish "1"|"2" reason now {robot stream seq}: done, or dead for that reason
+-- finish "1"|"2" reason now {ROBOT stream seq}: done, or dead for that reason
 function operations.finish(state, reason, now)
   local records, bytes = 0, 0
   for i = 5, #ARGV, 3 do
-    local tk, stream, seq = ARGV[i], ARGV[i + 1], ARGV[i + 2]
-    local robot, number = hex(tk), call('HGET', STREAMS, tk .. stream)
+    local robot, stream, seq = unpack(ARGV, i, i + 2)
+    local number = call('HGET', STREAMS, robot .. stream)
     local place = number and find(robot, number .. seq)
     if place then
-      local fields = read(place)
-      call('XACK', RECORDS, GROUP, place:sub(17))
-      call('XDEL', RECORDS, place:sub(17))
+      local fields = read(id_in(place))
+      call('XACK', RECORDS, GROUP, id_in(place))
+      call('XDEL', RECORDS, id_in(place))
       call('ZREM', QUEUE .. robot, place)
       call('ZREM', LEASE .. robot, place)
       if call('EXISTS', QUEUE .. robot) == 0 then
@@ -197,12 +199,12 @@ function operations.finish(state, reason, now)
         call('HDEL', HOLDER, robot)
       end
       local key, field = note(number .. seq)
-      call('HSET', key, field, state .. ARGV[i + 3])
+      call('HSET', key, field, state .. fields.d)
       if state == '1' then
         call('XADD', DONE, '*', 'n', number .. seq, 'a', now)
         records, bytes = records + 1, bytes + #fields.c
       else
-        call('XADD', DEAD, '0-' .. (call('XLEN', DEAD) + 1), 't', tk, 's', stream, 'q', seq, 'x', 0,
+        call('XADD', DEAD, '0-' .. (call('XLEN', DEAD) + 1), 't', robot, 's', stream, 'q', seq, 'x', 0,
           'r', reason, 'a', now, 'c', fields.c)
       end
     end
@@ -213,13 +215,13 @@ function operations.finish(state, reason, now)
   end
 end
 
--- state now robot stream seq: "U"nknown "W"aiting "L"eased, or "1" "2"
-function operations.state(now, tk, stream, seq)
-  local number = call('HGET', STREAMS, tk .. stream)
+-- state now ROBOT stream seq: "U"nknown "W"aiting "L"eased, or "1" "2"
+function operations.state(now, robot, stream, seq)
+  local number = call('HGET', STREAMS, robot .. stream)
   if not number then return 'U' end
-  local place = find(hex(tk), number .. seq)
+  local place = find(robot, number .. seq)
   if place then
-    local till = call('ZSCORE', LEASE .. hex(tk), place)
+    local till = call('ZSCORE', LEASE .. robot, place)
     return till and tonumber(till) > tonumber(now) and 'L' or 'W'
   end
   local finished = call('HGET', note(number .. seq))
@@ -233,7 +235,7 @@ function operations.statistics(now)
     leased = leased + call('ZCOUNT', LEASE .. robot, '(' .. now, '+inf')
   end
   local oldest, arrived = call('XRANGE', RECORDS, '-', '+', 'COUNT', 1)[1], ''
-  if oldest then arrived = read(string.rep('-', 16) .. oldest[1]).a end
+  if oldest then arrived = read(oldest[1]).a end
   return {call('XLEN', RECORDS), leased, call('XLEN', DONE), call('XLEN', DEAD), tonumber(call('HGET', META, 'bytes')),
     arrived}
 end

@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from bridge.store.redis_server import RedisServer
 from conftest import unavailable
+
+
+@pytest.fixture(scope="session")
+def redis_server(tmp_path_factory) -> Iterator[RedisServer]:
+    """A durable Redis that all tests share; each has its own binding."""
+    server = RedisServer(tmp_path_factory.mktemp("redis"))
+    yield server
+    server.kill()
 
 
 @pytest.fixture

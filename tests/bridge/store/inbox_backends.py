@@ -7,15 +7,19 @@ name in BACKENDS.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+from bridge.store.redis_server import RedisServer
 from rosbridge_eth.store import Inbox, InboxLimits, SqliteInbox
 from rosbridge_eth.store.inbox import DEFAULT_LIMITS
+from rosbridge_eth.store.redis_inbox import RedisInbox
 
 
 class Backend(Protocol):
-    def __init__(self, folder: Path) -> None: ...
+    def __init__(self, folder: Path, fixture: Callable[[str], Any]) -> None:
+        """folder: its own, empty. fixture: gives a fixture of this name, such as a running service."""
 
     def open(self, limits: InboxLimits = DEFAULT_LIMITS) -> Inbox:
         """Another Inbox on the same data."""
@@ -31,7 +35,7 @@ class Backend(Protocol):
 
 
 class SqliteBackend:
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, fixture: Callable[[str], Any]) -> None:
         self._path = folder / "inbox.db"
 
     def open(self, limits: InboxLimits = DEFAULT_LIMITS) -> Inbox:
@@ -45,4 +49,21 @@ class SqliteBackend:
             path.unlink()
 
 
-BACKENDS: dict[str, type[Backend]] = {"sqlite": SqliteBackend}
+class RedisBackend:
+    def __init__(self, folder: Path, fixture: Callable[[str], Any]) -> None:
+        self._server: RedisServer = fixture("redis_server")
+        self._binding = str(folder)
+
+    def open(self, limits: InboxLimits = DEFAULT_LIMITS) -> Inbox:
+        return RedisInbox(self._server.url, self._binding, limits)
+
+    def opener_source(self) -> str:
+        module = "__import__('rosbridge_eth.store.redis_inbox').store.redis_inbox"
+        return f"{module}.RedisInbox({self._server.url!r}, {self._binding!r})"
+
+    def clear(self) -> None:
+        with self._server.client() as client:
+            client.flushall()
+
+
+BACKENDS: dict[str, type[Backend]] = {"sqlite": SqliteBackend, "redis": RedisBackend}

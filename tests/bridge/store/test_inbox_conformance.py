@@ -28,7 +28,7 @@ T0 = 1_763_690_000.0
 
 @pytest.fixture(params=list(BACKENDS))
 def backend(request, tmp_path) -> Backend:
-    return BACKENDS[request.param](tmp_path)
+    return BACKENDS[request.param](tmp_path, request.getfixturevalue)
 
 
 @pytest.fixture
