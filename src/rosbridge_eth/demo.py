@@ -104,6 +104,7 @@ class _Server:
 
     worker: Worker
     submission: Submission
+    timings: list[BatchTiming]
     stop: threading.Event = field(default_factory=threading.Event)
     failures: list[BaseException] = field(default_factory=list)
     threads: list[threading.Thread] = field(default_factory=list)
@@ -173,6 +174,7 @@ def run_demo(
     config = load_server_config(home.config)
     [sock] = server_sockets(config.listen)
     registry, journal = Registry(home.registry), open_journal(home, deployment)
+    timings: list[BatchTiming] = []
     server = _Server(
         open_worker(
             0, sock, config=config, identity=load_server_identity(home, passphrase),
@@ -181,8 +183,9 @@ def run_demo(
         ),
         open_submission(
             config=config, contract=contract, journal=journal, inbox=open_inbox(config, home), registry=registry,
-            keys=keys,
+            keys=keys, on_confirmed=timings.append,
         ),
+        timings,
     )
     relay = Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)
     robot_home.config.write_text(robot_toml(topics, bag, relay.port))
@@ -213,7 +216,7 @@ def run_demo(
     stages.verified = comparison.equal
     on_progress(stages)
     return DemoResult(
-        stages, tuple(server.submission.timings), reading, tuple(records), comparison, deployment.contract,
+        stages, tuple(server.timings), reading, tuple(records), comparison, deployment.contract,
         time.monotonic() - started,
     )
 
@@ -245,7 +248,7 @@ def _progress(robot: Robot, server: _Server, stages: Stages, on_progress: Callab
     stages.sent = robot.sender.statistics.sent
     stages.retransmitted = robot.client.statistics().frames_retransmitted
     stages.stored = robot.sender.statistics.stored
-    stages.included = sum(timing.records for timing in server.submission.timings)
+    stages.included = sum(timing.records for timing in server.timings)
     on_progress(stages)
 
 
@@ -257,7 +260,7 @@ def _settle(server: _Server, stages: Stages, on_progress: Callable[[Stages], Non
         if time.monotonic() > deadline:
             raise BridgeError(f"{stages.stored - stages.included} records are in no block after {SETTLE:.0f} s")
         server.stop.wait(0.02)
-        stages.included = sum(timing.records for timing in server.submission.timings)
+        stages.included = sum(timing.records for timing in server.timings)
         on_progress(stages)
 
 
@@ -266,7 +269,7 @@ def _costs(robot: Robot, server: _Server, stages: Stages) -> None:
     times = robot.recorder.times
     for name, total in (("capture", times.capture), ("seal", times.seal), ("spool", times.spool)):
         stages.times[f"{name}, per record"] = total / max(1, times.records)
-    batches = server.submission.timings
+    batches = server.timings
     for name in ("submit", "include", "confirm"):
         stages.times[f"{name}, per batch"] = median(getattr(batch, name) for batch in batches) if batches else 0.0
 

@@ -27,6 +27,7 @@ from rosbridge_eth.ledger.submitter import (
 )
 
 MAX_ROUNDS = 1_000
+LONGEST_PAUSE = 1.0  # seconds; how long `stop` may have to wait
 
 
 def perform(chain: Chain, action: Action) -> Answer:
@@ -52,15 +53,22 @@ def perform(chain: Chain, action: Action) -> Answer:
         return failure
 
 
-def pump(submitter: Submitter, chain: Chain, now: float) -> int:
-    """Do all that can be done at `now`; how many questions it took."""
+def pump(submitter: Submitter, chain: Chain, now: float, *, clock: Callable[[], float] | None = None) -> int:
+    """Do all that can be done at `now`; how many questions it took.
+
+    clock: read as each answer comes, so that latencies count the node's time;
+    without it every answer counts as of `now`.
+    """
     asked = 0
     for _ in range(MAX_ROUNDS):
         actions = submitter.actions(now)
         if not actions:
             break
         for action in actions:
-            submitter.handle(action, perform(chain, action), now)
+            answer = perform(chain, action)
+            if clock is not None:
+                now = max(now, clock())  # a wall clock that is set back must not undo what was timed
+            submitter.handle(action, answer, now)
         asked += len(actions)
     return asked
 
@@ -76,8 +84,8 @@ def run(
     """Pump until `stop` is set; `wake` cuts a pause short, for instance when something was sealed."""
     pause = wake or stop
     while not stop.is_set():
-        pump(submitter, chain, clock())
+        pump(submitter, chain, clock(), clock=clock)
         now = clock()
-        if pause.wait(max(0.0, min(submitter.next_timer(now) - now, 60.0))) and pause is not stop:
+        if pause.wait(max(0.0, min(submitter.next_timer(now) - now, LONGEST_PAUSE))) and pause is not stop:
             pause.clear()
     submitter.close()

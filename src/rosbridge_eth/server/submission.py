@@ -14,7 +14,7 @@ from collections.abc import Callable
 from rosbridge_eth.ledger.batching import Batcher, Limits, refusal
 from rosbridge_eth.ledger.chain import Chain
 from rosbridge_eth.ledger.pump import pump
-from rosbridge_eth.ledger.submitter import BatchTiming, Submitter
+from rosbridge_eth.ledger.submitter import BatchTiming, Status, Submitter
 from rosbridge_eth.records import SealedRecord
 from rosbridge_eth.store import Inbox
 
@@ -42,21 +42,27 @@ class Submission:
         holder: str,
         keep_batches: float,
         prune: Callable[[float], int],
+        on_confirmed: Callable[[BatchTiming], None] = lambda timing: None,
     ) -> None:
         self._inbox, self._submitter, self._chain = inbox, submitter, chain
         self._limits, self._batcher, self._holder = limits, Batcher(limits), holder
         self._keep_batches, self._prune = keep_batches, prune
         self._forget_at = 0.0
-        self.timings: list[BatchTiming] = []
+        self._on_confirmed = on_confirmed
         self._said: str | None = None
+        self.gathered = 0
+        self.sealed = 0
 
-    def turn(self, now: float, *, flush: bool = False) -> bool:
-        """Do what can be done at `now`; whether anything moved. `flush` closes batches before they are full or old."""
+    def turn(self, now: float, *, flush: bool = False, clock: Callable[[], float] | None = None) -> bool:
+        """Do what can be done at `now`; whether anything moved. `flush` closes batches before they are full or old.
+
+        clock: with it, what the node takes its time for is timed to the end.
+        """
         moved = self._gather(now)
         for batch in self._batcher.due(now, flush=flush):
             self._seal(batch, now)
             moved = True
-        pump(self._submitter, self._chain, now)
+        pump(self._submitter, self._chain, now, clock=clock)
         moved = self._tell(now) or moved
         if now >= self._forget_at:
             self._forget_at = now + FORGET_EVERY
@@ -71,6 +77,7 @@ class Submission:
         leased = self._inbox.lease(
             self._holder, limit=LEASE_RECORDS, max_bytes=LEASE_BYTES, now=now, ttl=LEASE
         )
+        self.gathered += len(leased)
         for entry in leased:
             if refusal(entry.record, self._limits) is None:
                 self._batcher.add(entry.record, now)
@@ -81,6 +88,7 @@ class Submission:
     def _seal(self, batch: list[SealedRecord], now: float) -> None:
         sealing = self._submitter.seal(batch, now)
         self._inbox.done([record.id for record in batch], now)
+        self.sealed += len(sealing.jobs)
         for job in sealing.jobs:
             log.info("batch %s of robot %s: %d records", job.batch_index, job.robot.hex()[:8], job.count)
         for id in sealing.dead:
@@ -91,7 +99,7 @@ class Submission:
         if confirmed:
             self._submitter.acknowledge(confirmed)
         for timing in self._submitter.timings():
-            self.timings.append(timing)
+            self._on_confirmed(timing)
             log.info("batch of %d records confirmed in block %d, 0x%s", timing.records, timing.block_number,
                      timing.tx_hash.hex())
         status = self._submitter.status()
@@ -103,15 +111,26 @@ class Submission:
             self._said = trouble
         return bool(confirmed)
 
+    def status(self) -> Status:
+        """Why the ledger's end is as it is."""
+        return self._submitter.status()
+
     @property
     def idle(self) -> bool:
         """Nothing is gathered and nothing is on its way."""
         return len(self._batcher) == 0 and self._submitter.idle()
 
-    def run(self, stopped: Callable[[], bool], *, clock: Callable[[], float] = time.time) -> None:
-        """Until `stopped()`. What is gathered and not sealed stays in the inbox."""
+    def run(
+        self,
+        stopped: Callable[[], bool],
+        *,
+        clock: Callable[[], float] = time.time,
+        on_turn: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Until `stopped()`. What is gathered and not sealed stays in the inbox. on_turn: called after every turn."""
         pause = SHORTEST_PAUSE
         while not stopped():
-            pause = SHORTEST_PAUSE if self.turn(clock()) else min(2 * pause, LONGEST_PAUSE)
+            pause = SHORTEST_PAUSE if self.turn(clock(), clock=clock) else min(2 * pause, LONGEST_PAUSE)
+            on_turn()
             time.sleep(pause)
         self._submitter.close()
