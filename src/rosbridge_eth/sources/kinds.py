@@ -23,6 +23,7 @@ class SourceSettings(Protocol):
 
 KINDS: dict[str, str] = {
     "bag": "rosbridge_eth.sources.bag:BagSource",
+    "ros2": "rosbridge_eth.sources.ros2:Ros2Source",
     "sim": "rosbridge_eth.sources.sim:SimSource",
 }
 """Kind to factory, called with (settings, selection, clock or None)."""

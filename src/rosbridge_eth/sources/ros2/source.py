@@ -1,0 +1,482 @@
+"""A live ROS 2 graph, through the robot's own rclpy: any DDS or Zenoh middleware that it is set up with.
+
+Messages are subscribed to as bytes and decoded by rosbags, as those of every
+other source: equal messages give equal records. One thread waits in rclpy and
+puts what arrives into a Backlog; the thread that runs the source empties it.
+
+Every LOOK_EVERY the graph is read (from rclpy's own memory, microseconds): topics
+appear, publishers change what they offer. A subscription stays for KEEP after
+the last publisher has gone, so that one that is restarted misses nothing.
+
+Where the middleware numbers messages and says who published them (Fast DDS on
+Kilted), losses are counted and a change of subscription loses and repeats nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, ClassVar, Final
+
+from rosbridge_eth.capture import Decoder, RawMessage
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.backlog import Backlog
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.ros2.definitions import decoder_of, message_class
+from rosbridge_eth.sources.ros2.quality import Quality, most_that_all_offer, quality_of
+from rosbridge_eth.sources.selection import Selection, Watch
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY: Final = 0.25
+"""Seconds between looks at the graph: what a late topic publishes before is missed, unless it is latched."""
+KEEP: Final = 300.0
+"""Seconds that a subscription outlives the last publisher."""
+UNMATCHED_AFTER: Final = 5.0
+"""Seconds after which names that nothing publishes are told."""
+STOP_TIME: Final = 2.0
+_SHARED: Final = frozenset({"/rosout", "/parameter_events"})
+"""Topics that every node publishes; naming a node does not mean them."""
+_UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
+
+GET_RCLPY: Final = (
+    "start the robot in an environment where ROS 2 is sourced (source /opt/ros/DISTRO/setup.bash), with the Python "
+    "that ROS was built for, or install it beside this package: pip install 'ros-rclpy[fastrtps]' and the robot's "
+    "message packages, such as ros-nav-msgs; docs/howto-ros2.md tells more"
+)
+
+
+@dataclass(frozen=True)
+class Ros2Settings:
+    """How the graph is joined.
+
+    domain: ROS domain; None follows ROS_DOMAIN_ID.
+    node: name of the node that the robot becomes, without namespace.
+    depth: messages that the middleware keeps of each topic for us.
+    """
+
+    kind: ClassVar[str] = "ros2"
+    domain: int | None = None
+    node: str = "rosbridge_eth"
+    depth: int = 256
+
+
+@dataclass(frozen=True, slots=True)
+class TopicCounts:
+    """Messages of a topic so far.
+
+    lost: did not reach this process (best effort, or faster than the queue of `depth` was emptied).
+    dropped: reached it, but the robot was too slow. foreign: of a publisher with another definition of the type.
+    """
+
+    received: int = 0
+    lost: int = 0
+    dropped: int = 0
+    foreign: int = 0
+
+
+@dataclass
+class _Topic:
+    """A watched topic: its subscription and what is known of its publishers."""
+
+    offer: Offer
+    generated: Any
+    decoder: Decoder
+    quality: Quality
+    subscription: Any = None
+    type_hash: str | None = None
+    publishers: frozenset[bytes] = frozenset()
+    foreign: frozenset[bytes] = frozenset()
+    last_seen: float = 0.0
+    sequence: dict[bytes, int] = field(default_factory=dict)
+    numbered: bool = False  # whether the middleware says publisher and number of a message
+    received: int = 0
+    lost: int = 0
+    left_out: int = 0
+
+
+class Ros2Source:
+    """The watched topics of one ROS 2 graph. Its own rclpy context: no signal handler is set, no argument read."""
+
+    live = True
+
+    def __init__(self, settings: Ros2Settings, selection: Selection, clock: Clock | None = None) -> None:
+        """Joins the graph. Raises SourceError if rclpy is not there or cannot."""
+        self._settings, self._selection, self._clock = settings, selection, clock or SystemClock()
+        self._watch = Watch(selection, LOOK_EVERY)
+        self._backlog = Backlog()
+        self._topics: dict[tuple[str, str], _Topic] = {}
+        self._unusable: set[tuple[str, str]] = set()
+        self._said: set[tuple[str, str]] = set()
+        self._look_now = False
+        self._ending = threading.Event()
+        self._receiving: threading.Thread | None = None
+        self._failure: BaseException | None = None
+        self._closing = threading.Lock()
+        self._open = False
+        self._rclpy = _import_rclpy()
+        self._context = self._rclpy.Context()
+        try:
+            # No logging: rclpy would open files in the home of whoever runs the robot.
+            self._context.init(args=[], initialize_logging=False, domain_id=settings.domain)
+            self._node = self._rclpy.Node(
+                settings.node,
+                context=self._context,
+                use_global_arguments=False,
+                enable_rosout=False,
+                start_parameter_services=False,
+            )
+            self._executor = self._rclpy.SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self._node)
+        except Exception as error:
+            # rclpy has classes for bad names and domains and passes on what the middleware raises: an open set.
+            self._context.try_shutdown()
+            raise SourceError(f"the ROS 2 graph cannot be joined: {_first_line(error)}") from error
+        self._open = True
+        self._full_name = self._node.get_fully_qualified_name()
+
+    # What Source asks for
+
+    def offers(self) -> Sequence[Offer]:
+        """The topics that somebody publishes now, without hidden ones. Discovery takes a second or two."""
+        return self._read_graph()[0]
+
+    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
+        return {}
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Emit what arrives until `stop` is set or the source is closed. Raises SourceError."""
+        if not self._open or self._receiving is not None:
+            raise SourceError("a ROS 2 source runs once")
+        self._receiving = threading.Thread(target=self._receive, name="rclpy", daemon=True)
+        self._receiving.start()
+        try:
+            while not stop.is_set():
+                message = self._backlog.take(0.1)
+                if message is not None:
+                    emit(message)
+                elif not self._receiving.is_alive():
+                    break
+        finally:
+            self.close()
+        if isinstance(self._failure, RuntimeError):
+            raise SourceError(f"the ROS 2 graph was lost: {_first_line(self._failure)}") from self._failure
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._ending.set()
+        self._backlog.close()
+        with self._closing:
+            if not self._open:
+                return
+            self._open = False
+            self._executor.wake()
+            if self._receiving is not None:
+                self._receiving.join(STOP_TIME)
+            self._executor.shutdown(timeout_sec=STOP_TIME)
+            self._node.destroy_node()
+            self._context.try_shutdown()
+
+    def statistics(self) -> Mapping[str, TopicCounts]:
+        """By topic."""
+        dropped = self._backlog.dropped
+        counts: dict[str, TopicCounts] = {}
+        for topic in list(self._topics.values()):
+            name = topic.offer.topic
+            so_far = counts.get(name, TopicCounts(dropped=dropped.get(name, 0)))
+            counts[name] = TopicCounts(
+                so_far.received + topic.received, so_far.lost + topic.lost, so_far.dropped,
+                so_far.foreign + topic.left_out,
+            )  # fmt: skip
+        return counts
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Messages received and lost here for want of time, by topic."""
+        return self._backlog.dropped
+
+    # The receiving thread
+
+    def _receive(self) -> None:
+        try:
+            now = self._now()
+            complain_at = now + UNMATCHED_AFTER
+            while not self._ending.is_set():
+                now = self._now()
+                due = self._watch.next_timer()
+                if due is None or now >= due or self._look_now:
+                    self._look(now)
+                    due = now + LOOK_EVERY
+                if now >= complain_at:
+                    self._tell_unmatched()
+                    complain_at = float("inf")
+                self._executor.spin_once(timeout_sec=max(due - now, 0.0))
+        except BaseException as error:  # handed to the thread that runs the source, which raises it
+            if not self._ending.is_set():
+                self._failure = error
+        finally:
+            self._backlog.close()
+
+    def _now(self) -> float:
+        return self._clock.monotonic_ns() / 1e9
+
+    def _look(self, now: float) -> None:
+        """Read the graph; subscribe to what has come, adapt to what has changed, leave what is over."""
+        self._look_now = False
+        offers, publishers = self._read_graph()
+        published = {(offer.topic, offer.type_name) for offer in offers}
+        for key in published:
+            if topic := self._topics.get(key):
+                topic.last_seen = now
+        waiting = [
+            topic.offer
+            for key, topic in self._topics.items()
+            if key not in published and now - topic.last_seen < KEEP
+        ]
+        changes = self._watch.update([*offers, *waiting], now)
+        for offer in changes.removed:
+            if (gone := self._topics.pop((offer.topic, offer.type_name), None)) is not None:
+                self._node.destroy_subscription(gone.subscription)
+                log.info("%s: left", offer.topic)
+        for offer in changes.added:
+            self._join(offer, publishers.get((offer.topic, offer.type_name), []), now)
+        for key, topic in self._topics.items():
+            found = publishers.get(key, [])
+            self._know(topic, found)
+            self._adapt(topic, found)
+
+    def _read_graph(self) -> tuple[list[Offer], dict[tuple[str, str], list[Any]]]:
+        offers: list[Offer] = []
+        publishers: dict[tuple[str, str], list[Any]] = {}
+        for name, _ in sorted(self._node.get_topic_names_and_types()):
+            if any(part.startswith("_") for part in name.split("/")) and not self._selection.names(name):
+                continue
+            nodes: dict[str, set[str]] = {}
+            for endpoint in self._node.get_publishers_info_by_topic(name):
+                node = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                if node == self._full_name:
+                    continue
+                found = nodes.setdefault(endpoint.topic_type, set())
+                if endpoint.node_name != _UNKNOWN_NODE and name not in _SHARED:
+                    found.add(node)
+                publishers.setdefault((name, endpoint.topic_type), []).append(endpoint)
+            offers += [Offer(name, kind, tuple(sorted(found))) for kind, found in sorted(nodes.items())]
+        return offers, publishers
+
+    def _join(self, offer: Offer, publishers: Sequence[Any], now: float) -> None:
+        key = (offer.topic, offer.type_name)
+        if key in self._unusable:
+            return
+        try:
+            quality = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
+            generated, decoder = message_class(offer.type_name), decoder_of(offer.type_name)
+            topic = _Topic(offer, generated, decoder, quality, last_seen=now)
+            topic.subscription = self._subscribe(topic, topic.quality)
+        except SourceError as error:
+            self._unusable.add(key)
+            log.warning("%s is left out: %s", offer.topic, error)
+            return
+        topic.type_hash = self._own_type_hash(offer)
+        self._topics[key] = topic
+        log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)
+
+    def _subscribe(self, topic: _Topic, quality: Quality) -> Any:
+        policies = self._rclpy
+        profile = policies.QoSProfile(
+            depth=self._settings.depth,
+            history=policies.HistoryPolicy.KEEP_LAST,
+            reliability=getattr(policies.ReliabilityPolicy, "RELIABLE" if quality.reliable else "BEST_EFFORT"),
+            durability=getattr(policies.DurabilityPolicy, "TRANSIENT_LOCAL" if quality.latched else "VOLATILE"),
+        )
+        try:
+            return self._node.create_subscription(
+                topic.generated,
+                topic.offer.topic,
+                self._callback(topic),
+                profile,
+                event_callbacks=policies.SubscriptionEventCallbacks(
+                    incompatible_qos=self._incompatible, use_default_callbacks=False
+                ),
+                raw=True,
+            )
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise SourceError(f"it cannot be subscribed to: {_first_line(error)}") from error
+
+    def _incompatible(self, event: Any) -> None:
+        """A publisher has come that offers less than we ask for: look at once, not at the next turn."""
+        self._look_now = True
+
+    def _own_type_hash(self, offer: Offer) -> str | None:
+        """The hash of the type as it is installed here, which our own subscription advertises."""
+        for endpoint in self._node.get_subscriptions_info_by_topic(offer.topic):
+            node = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+            if node == self._full_name and endpoint.topic_type == offer.type_name:
+                return _type_hash(endpoint)
+        return None
+
+    def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
+        """Who publishes the topic now, and who of them with another definition of its type."""
+        present = {bytes(endpoint.endpoint_gid): endpoint for endpoint in publishers}
+        topic.publishers = frozenset(present)
+        foreign = {
+            gid: endpoint
+            for gid, endpoint in present.items()
+            if topic.type_hash is not None and _type_hash(endpoint) not in (None, topic.type_hash)
+        }
+        for endpoint in foreign.values():
+            self._tell_foreign(topic, endpoint)
+        topic.foreign = frozenset(foreign)
+        for gone in topic.sequence.keys() - present.keys():
+            del topic.sequence[gone]
+
+    def _adapt(self, topic: _Topic, publishers: Sequence[Any]) -> None:
+        """Subscribe anew if the publishers offer more or less than is asked for."""
+        wanted = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
+        if not publishers or wanted == topic.quality:
+            return
+        weaker = (topic.quality.reliable and not wanted.reliable) or (topic.quality.latched and not wanted.latched)
+        if weaker or topic.numbered:  # else: latched messages would come again, and nothing tells that they were seen
+            self._change(topic, wanted)
+
+    def _change(self, topic: _Topic, wanted: Quality) -> None:
+        """Subscribe anew, with other quality. Where messages are numbered, nothing is lost or repeated by it."""
+        old = topic.subscription
+        if not topic.numbered:
+            self._node.destroy_subscription(old)
+        topic.subscription = self._subscribe(topic, wanted)
+        if topic.numbered:
+            while (waiting := _take(old, topic.generated)) is not None:
+                self._arrived(topic, *waiting)
+            self._node.destroy_subscription(old)
+        log.info("%s: publishers changed, now watched as %s", topic.offer.topic, wanted)
+        topic.quality = wanted
+
+    def _callback(self, topic: _Topic) -> Callable[[bytes, Any], None]:
+        def arrived(raw: bytes, info: Any) -> None:
+            self._arrived(topic, raw, info)
+
+        return arrived
+
+    def _arrived(self, topic: _Topic, raw: bytes, info: Mapping[str, Any]) -> None:
+        identity = info.get("publisher_gid")
+        publisher = bytes(identity["data"]) if identity else None
+        if publisher is not None and publisher not in topic.publishers:
+            # Somebody new, faster than our look at the graph: nothing of a foreign type may pass meanwhile.
+            offer, self._look_now = topic.offer, True
+            found = self._node.get_publishers_info_by_topic(offer.topic)
+            self._know(topic, [endpoint for endpoint in found if endpoint.topic_type == offer.type_name])
+        if topic.foreign and (publisher is None or publisher in topic.foreign):
+            topic.left_out += 1
+            return
+        number = info.get("publication_sequence_number")
+        if publisher is not None and number is not None:
+            topic.numbered = True
+            last = topic.sequence.get(publisher)
+            if last is not None and number <= last:
+                return  # received before the subscription was changed
+            topic.sequence[publisher] = number
+            if last is not None and number > last + 1:
+                self._lost(topic, number - last - 1)
+        topic.received += 1
+        received_ns = info.get("received_timestamp") or self._clock.wall_ns()
+        self._backlog.put(RawMessage(topic.offer.topic, topic.offer.type_name, received_ns, raw, topic.decoder))
+
+    # What a person is told, once
+
+    def _lost(self, topic: _Topic, count: int) -> None:
+        topic.lost += count
+        if self._first(topic.offer.topic, "lost"):
+            why = "a larger depth in [source] may help" if topic.quality.reliable else "its publisher is best effort"
+            name = topic.offer.topic
+            log.warning("%s: messages were lost on their way here (%d now, then counted); %s", name, count, why)
+
+    def _tell_foreign(self, topic: _Topic, endpoint: Any) -> None:
+        if self._first(topic.offer.topic, _type_hash(endpoint) or ""):
+            log.warning(
+                "%s: %s%s%s publishes with another definition of %s than is installed here; its messages are left out "
+                "and counted. Build both from the same version of package %s",
+                topic.offer.topic,
+                endpoint.node_namespace,
+                "" if endpoint.node_namespace.endswith("/") else "/",
+                endpoint.node_name,
+                topic.offer.type_name,
+                topic.offer.type_name.partition("/")[0],
+            )
+
+    def _tell_unmatched(self) -> None:
+        offers = self._read_graph()[0]
+        missing = self._selection.unmatched(offers)
+        if missing:
+            there = ", ".join(map(str, offers[:20])) or "no topics"
+            log.warning(
+                "nothing publishes %s yet; domain %d has %s. Check ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE",
+                ", ".join(missing),
+                self._context.get_domain_id(),
+                there,
+            )
+
+    def _first(self, topic: str, what: str) -> bool:
+        first = (topic, what) not in self._said
+        self._said.add((topic, what))
+        return first
+
+
+@dataclass(frozen=True)
+class _Rclpy:
+    """The parts of rclpy that are used; its modules have no types here, and it is imported only when needed."""
+
+    Context: Any
+    Node: Any
+    SingleThreadedExecutor: Any
+    QoSProfile: Any
+    HistoryPolicy: Any
+    ReliabilityPolicy: Any
+    DurabilityPolicy: Any
+    SubscriptionEventCallbacks: Any
+
+
+def _import_rclpy() -> _Rclpy:
+    try:
+        qos = import_module("rclpy.qos")
+        try:
+            events = import_module("rclpy.event_handler")
+        except ModuleNotFoundError:  # before Iron
+            events = import_module("rclpy.qos_event")
+        return _Rclpy(
+            import_module("rclpy.context").Context,
+            import_module("rclpy.node").Node,
+            import_module("rclpy.executors").SingleThreadedExecutor,
+            qos.QoSProfile,
+            qos.HistoryPolicy,
+            qos.ReliabilityPolicy,
+            qos.DurabilityPolicy,
+            events.SubscriptionEventCallbacks,
+        )
+    except ModuleNotFoundError as error:
+        if error.name == "rclpy":
+            raise SourceError(f"a ROS 2 source needs rclpy, which this Python does not have; {GET_RCLPY}") from None
+        raise SourceError(f"rclpy is there but needs {error.name}, which is not; {GET_RCLPY}") from error
+    except ImportError as error:
+        raise SourceError(f"rclpy cannot be loaded: {_first_line(error)}; {GET_RCLPY}") from error
+
+
+def _take(subscription: Any, generated: Any) -> tuple[bytes, Mapping[str, Any]] | None:
+    """What the executor would take next from a subscription, without waiting."""
+    with subscription.handle:
+        taken: tuple[bytes, Mapping[str, Any]] | None = subscription.handle.take_message(generated, True)
+    return taken
+
+
+def _type_hash(endpoint: Any) -> str | None:
+    """RIHS (REP 2016) of the type that an endpoint advertises; None if it does not."""
+    advertised = getattr(endpoint, "topic_type_hash", None)
+    return str(advertised) if advertised is not None and advertised.version > 0 else None
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().partition("\n")[0].partition(", at ")[0] or type(error).__name__
