@@ -3,8 +3,8 @@
 A live source must not make a publisher wait: ROS would slow the robot down, or
 drop the connection. So whatever receives puts messages here without waiting,
 and whatever feeds the robot takes them out. When there is no room, the oldest
-message of the topic that holds the most bytes goes, and is counted: a camera
-that floods the robot costs images, not the odometry beside it.
+message of the topic that takes most of it goes, and is counted: a camera that
+floods the robot costs images, not the odometry beside it.
 """
 
 from __future__ import annotations
@@ -52,8 +52,10 @@ class Backlog:
             if size > self._size_limit:
                 said = self._count(topic)
             else:
-                while self._messages and (len(self._messages) >= self._limit or self._total + size > self._size_limit):
-                    said = self._drop_oldest() or said
+                while len(self._messages) >= self._limit:
+                    said = self._drop_oldest(max(self._by_topic, key=lambda name: len(self._by_topic[name]))) or said
+                while self._total + size > self._size_limit:
+                    said = self._drop_oldest(max(self._bytes, key=self._bytes.__getitem__)) or said
                 self._messages[self._next] = message
                 self._by_topic.setdefault(topic, deque()).append(self._next)
                 self._bytes[topic] = self._bytes.get(topic, 0) + size
@@ -94,8 +96,7 @@ class Backlog:
     def __len__(self) -> int:
         return len(self._messages)
 
-    def _drop_oldest(self) -> str | None:
-        topic = max(self._bytes, key=self._bytes.__getitem__)
+    def _drop_oldest(self, topic: str) -> str | None:
         self._forget(self._messages.pop(self._by_topic[topic][0]))
         return self._count(topic)
 

@@ -46,6 +46,16 @@ def test_a_flood_costs_its_own_topic_and_the_newest_stay(caplog):
     assert "/camera" in caplog.text
 
 
+def test_many_small_messages_do_not_cost_a_few_large_ones_their_place():
+    backlog = Backlog(messages=20, size=1_000_000)
+    for number in range(3):
+        backlog.put(message("/map", number, 100_000))
+    for number in range(500):
+        backlog.put(message("/imu", number, 10))
+    assert backlog.dropped == {"/imu": 483}
+    assert [number for topic, number in drain(backlog) if topic == "/map"] == [0, 1, 2]
+
+
 @pytest.mark.parametrize("size", [1, 1000, 5000])
 def test_bytes_are_bounded(size):
     limit = 20_000
