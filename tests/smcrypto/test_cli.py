@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import getpass
+import hmac
+import io
 import os
+import pty
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from smcrypto.cli import main
+import smcrypto
+from smcrypto import __version__, sm2, sm3, sm4
+from smcrypto.cli import digest, files, main
 
+# A process of its own finds the package where this one did.
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(smcrypto.__file__).parents[1])}
 ABC_DIGEST = "66c7f0f462eeedd9d1f2d46bdc10e4e24167c4875cf2f7a2297da02b8f4ba8e0"  # GB/T 32905, A.1
 
 
@@ -49,11 +60,25 @@ def test_hash_prints_as_sha256sum_does(folder: Path, capsys: pytest.CaptureFixtu
 
 
 def test_hash_reads_a_pipe() -> None:
-    done = subprocess.run([sys.executable, "-m", "smcrypto", "hash"], input=b"abc", capture_output=True, check=True)
-    assert done.stdout == f"{ABC_DIGEST}  -\n".encode()
+    done = subprocess.run([sys.executable, "-m", "smcrypto", "hash"], input=b"abc", capture_output=True, check=True,
+                          env=ENVIRONMENT)  # fmt: skip
+    assert done.stdout == f"{ABC_DIGEST}  -\n".encode() and done.stderr == b""
 
 
-def test_hmac_is_that_of_openssl(folder: Path, openssl: Callable[..., bytes], capsys: pytest.CaptureFixture[str]) -> None:
+def test_hash_and_hmac_of_many_files(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("large").write_bytes(bytes(files.CHUNK + 1))
+    Path("empty").write_bytes(b"")
+    names = ["large", "empty"]
+    assert main(["hash", *names]) == 0
+    assert capsys.readouterr().out == "".join(f"{sm3.digest(Path(n).read_bytes()).hex()}  {n}\n" for n in names)
+    assert main(["hmac", "--key-file", "password", *names]) == 0
+    mac = [hmac.new(Path("password").read_bytes(), Path(name).read_bytes(), sm3.SM3).hexdigest() for name in names]
+    assert capsys.readouterr().out == f"{mac[0]}  large\n{mac[1]}  empty\n"
+
+
+def test_hmac_is_that_of_openssl(
+    folder: Path, openssl: Callable[..., bytes], capsys: pytest.CaptureFixture[str]
+) -> None:
     Path("mac.key").write_bytes(bytes(range(32)))
     assert main(["hmac", "--key-file", "mac.key", "message"]) == 0
     ours = capsys.readouterr().out.split()[0]
@@ -145,17 +170,22 @@ def test_encryption_under_a_key_in_both_directions(folder: Path, openssl: Callab
 
 
 def test_a_decryption_that_fails_leaves_nothing_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    common = ["--password-file", "password", "--iterations", "1000"]
-    assert main(["encrypt", *common, "-o", "sealed", "message"]) == 0
-    Path("password").write_bytes(b"wrong\n")
+    key = bytes(16)
+    Path("sm4.key").write_bytes(key)
+    Path("sealed").write_bytes(sm4.encrypt(key, sm4.CBC(bytes(16)), bytes(3 << 20)))  # its end is no padding
+    Path("opened").write_bytes(b"what was there before")
     before = sorted(folder.iterdir())
-    # PKCS#7 passes by chance for one wrong key in 256; a message of many blocks then still differs.
-    code = main(["decrypt", *common, "-o", "opened", "sealed"])
-    if code == 0:
-        assert Path("opened").read_bytes() != Path("message").read_bytes()
-    else:
-        assert sorted(folder.iterdir()) == before
-        assert capsys.readouterr().err.startswith("smcrypto: ")
+    assert main(["decrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "-o", "opened", "sealed"]) == 1
+    assert "padding" in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before and Path("opened").read_bytes() == b"what was there before"
+
+
+def test_a_key_that_cannot_be_written_leaves_nothing_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("taken").mkdir()
+    before = sorted(folder.iterdir())
+    assert main(["keygen", "-o", "taken", "--force"]) == 1
+    assert main(["keygen", "-o", "absent/key.pem"]) == 1
+    assert sorted(folder.iterdir()) == before
 
 
 @pytest.mark.parametrize("arguments, says", [
@@ -166,13 +196,33 @@ def test_a_decryption_that_fails_leaves_nothing_behind(folder: Path, capsys: pyt
     (["encrypt", "--sm4-key-file", "password", "--iv", "zz", "message"], "hex"),
     (["encrypt", "--sm4-key-file", "password", "--iv", "00" * 16, "message"], "16 bytes"),
     (["encrypt", "--password-env", "UNSET_VARIABLE", "message"], "UNSET_VARIABLE"),
+    (["encrypt", "--password-file", "empty", "message"], "no password in empty"),
+    (["encrypt", "message"], "a password is needed"),
+    (["encrypt", "--password-file", "password", "--iterations", "0", "message"], "iterations must be"),
+    (["encrypt", "--password-file", "password", "--iv", "00", "message"], "--iv belongs to"),
+    (["encrypt", "--sm4-key-file", "sm4.key", "message"], "needs --iv"),
+    (["encrypt", "--sm4-key-file", "sm4.key", "--iv", "00", "message"], "iv must be 16 bytes"),
+    (["encrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--to", "pub.pem", "message"], "neither --to"),
+    (["decrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--key", "key.pem", "message"], "neither --key"),
+    (["decrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--password-file", "password"], "nor a password"),
+    (["encrypt", "--to", "pub.pem", "--password-file", "password", "message"], "without a password"),
+    (["decrypt", "--password-file", "password", "empty"], "Salted__"),
+    (["keygen", "-o", "new.pem", "--format", "sec1", "--password-file", "password"], "SEC1"),
+    (["verify", "--public", "message", "--signature", "message", "message"], "smcrypto: "),
+    (["hmac", "--key-file", "absent", "message"], "absent: No such file"),
+    (["hash", "."], "Is a directory"),
 ])
 def test_mistakes_end_in_one_line_and_exit_code_1(
-    folder: Path, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+    folder: Path, arguments: list[str], says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    Path("empty").write_bytes(b"")
+    Path("sm4.key").write_bytes(bytes(16))
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(), isatty=lambda: False))
+    before = sorted(folder.iterdir())
     assert main(arguments) == 1
-    error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
+    printed = capsys.readouterr()
+    assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+    assert sorted(folder.iterdir()) == before
 
 
 def test_a_command_line_that_makes_no_sense_exits_with_2() -> None:
@@ -188,3 +238,253 @@ def test_an_encrypted_key_needs_its_password(keys: Path, capsys: pytest.CaptureF
     Path("wrong").write_bytes(b"shut sesame")
     assert main(["sign", "--key", "locked.pem", "--password-file", "wrong", "message"]) == 1
     assert capsys.readouterr().err.startswith("smcrypto: ")
+
+
+def test_bytes_go_through_pipes_unchanged(keys: Path) -> None:
+    def run(*arguments: str, data: bytes) -> bytes:
+        return subprocess.run(
+            [sys.executable, "-m", "smcrypto", *arguments],
+            input=data, capture_output=True, check=True, env=ENVIRONMENT,
+        ).stdout  # fmt: skip
+
+    data = bytes(range(256)) * 3
+    sealed = run("encrypt", "--to", "pub.pem", "--encoding", "c1c3c2", data=data)
+    assert len(sealed) == len(data) + 97
+    assert run("decrypt", "--key", "key.pem", "--encoding", "c1c3c2", "-", data=sealed) == data
+    signature = run("sign", "--key", "key.pem", "--encoding", "raw", data=data)
+    sm2.PublicKey.from_pem(Path("pub.pem").read_bytes()).verify(signature, data, encoding="raw")
+    common = ["--password-file", "password", "--iterations", "1000"]
+    assert run("decrypt", *common, data=run("encrypt", *common, data=data)) == data
+
+
+def test_a_closed_pipe_is_no_traceback(keys: Path) -> None:
+    large = Path("large")
+    large.write_bytes(bytes(4 << 20))
+    Path("sm4.key").write_bytes(bytes(16))
+    with subprocess.Popen(
+        [sys.executable, "-m", "smcrypto", "encrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "large"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=ENVIRONMENT,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.read(10)
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
+def test_a_pipe_that_nobody_reads_is_noticed_before_the_end(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        assert main(["hash", "message"]) == 1  # one short line, which waits in a buffer
+    assert capfd.readouterr().err == ""
+
+
+def test_stdin_is_read_where_no_file_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in (["hash"], ["hash", "-"]):
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(b"abc")))
+        assert main(arguments) == 0
+        assert capsys.readouterr().out == f"{ABC_DIGEST}  -\n"
+
+
+def test_an_interrupt_has_its_exit_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(name: str) -> Iterator[bytes]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(digest, "chunks", interrupted)
+    assert main(["hash", "message"]) == 130
+
+
+def test_version_and_help_name_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    for option in ("--version", "--help"):
+        with pytest.raises(SystemExit) as exit:
+            main([option])
+        assert exit.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"smcrypto {__version__}" in printed
+    for command in ("hash", "hmac", "keygen", "pubkey", "sign", "verify", "encrypt", "decrypt", "ca"):
+        assert f"\n    {command}" in printed
+        with pytest.raises(SystemExit) as exit:
+            main([command, "--help"])
+        assert exit.value.code == 0 and f"smcrypto {command}" in capsys.readouterr().out
+
+
+def test_a_private_key_keeps_its_password_out_of_the_command_line(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("KEY_PASSWORD", "open sesame")
+    assert main(["keygen", "-o", "locked.pem", "--password-env", "KEY_PASSWORD", "--public", "locked.pub"]) == 0
+    key = sm2.PrivateKey.from_pem(Path("locked.pem").read_bytes(), b"open sesame")
+    assert key.public_key.to_pem() == Path("locked.pub").read_bytes()
+    assert main(["pubkey", "--key", "locked.pem", "--password-env", "KEY_PASSWORD", "-o", "again.pub"]) == 0
+    assert Path("again.pub").read_bytes() == Path("locked.pub").read_bytes()
+
+
+def test_sec1_keys_are_written_and_read(folder: Path, openssl: Callable[..., bytes]) -> None:
+    assert main(["keygen", "-o", "key.pem", "--format", "sec1", "--public", "pub.pem"]) == 0
+    assert Path("key.pem").read_bytes().startswith(b"-----BEGIN EC PRIVATE KEY-----")
+    assert openssl("pkey", "-in", "key.pem", "-pubout") == Path("pub.pem").read_bytes()
+
+
+@pytest.mark.parametrize("cipher", ["-aes-256-cbc", "-sm4-cbc"])
+def test_an_encrypted_key_of_openssl_opens_with_its_password(
+    folder: Path, cipher: str, openssl: Callable[..., bytes]
+) -> None:
+    if cipher != "-sm4-cbc":
+        pytest.importorskip("cryptography")
+    openssl("genpkey", "-algorithm", "SM2", cipher, "-pass", "file:password", "-out", "key.pem")
+    openssl("pkey", "-in", "key.pem", "-passin", "file:password", "-pubout", "-out", "pub.pem")
+    assert main(["pubkey", "--key", "key.pem", "--password-file", "password", "-o", "ours.pem"]) == 0
+    assert Path("ours.pem").read_bytes() == Path("pub.pem").read_bytes()
+
+
+# --- prompts ---
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """What a user types at the prompts; gives the list of prompts that were shown."""
+
+    def answer(*passwords: str) -> list[str]:
+        prompts: list[str] = []
+        waiting = list(passwords)
+
+        def ask(prompt: str) -> str:
+            prompts.append(prompt)
+            return waiting.pop(0)
+
+        monkeypatch.setattr(getpass, "getpass", ask)
+        monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
+        return prompts
+
+    return answer
+
+
+def test_a_new_password_is_asked_for_twice(folder: Path, typed: Callable[..., list[str]]) -> None:
+    prompts = typed("öffne dich", "öffne dich")
+    assert main(["keygen", "-o", "key.pem", "--encrypt"]) == 0
+    assert prompts == ["New password: ", "New password (again): "]
+    assert sm2.PrivateKey.from_pem(Path("key.pem").read_bytes(), "öffne dich".encode())
+    prompts = typed("öffne dich")
+    assert main(["sign", "--key", "key.pem", "-o", "sig", "message"]) == 0
+    assert prompts == ["Password for key.pem: "]
+
+
+def test_what_was_encrypted_at_a_prompt_is_decrypted_at_one(folder: Path, typed: Callable[..., list[str]]) -> None:
+    typed("sesame", "sesame")
+    assert main(["encrypt", "--iterations", "1000", "-o", "sealed", "message"]) == 0
+    prompts = typed("sesame")
+    assert main(["decrypt", "--iterations", "1000", "-o", "opened", "sealed"]) == 0
+    assert Path("opened").read_bytes() == Path("message").read_bytes() and prompts == ["Password: "]
+
+
+@pytest.mark.parametrize("answers, says", [(("one", "two"), "differ"), (("", ""), "no password in the prompt")])
+def test_a_mistyped_or_empty_password_writes_nothing(
+    folder: Path, typed: Callable[..., list[str]], answers: tuple[str, ...], says: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    typed(*answers)
+    assert main(["keygen", "-o", "key.pem", "--encrypt"]) == 1
+    assert says in capsys.readouterr().err and not Path("key.pem").exists()
+
+
+def test_no_password_is_asked_for_when_the_key_would_not_be_written(
+    keys: Path, typed: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    prompts = typed("never", "typed")
+    assert main(["keygen", "-o", "key.pem", "--encrypt"]) == 1
+    assert prompts == [] and "--force" in capsys.readouterr().err
+
+
+# --- progress ---
+
+
+@contextmanager
+def terminal() -> Iterator[Callable[[], str]]:
+    """stderr is a terminal; gives what it shows."""
+    leader, follower = pty.openpty()
+    with os.fdopen(follower, "w", buffering=1) as stderr, pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(sys, "stderr", stderr)
+
+        def shown() -> str:
+            os.set_blocking(leader, False)
+            with suppress(BlockingIOError):
+                return os.read(leader, 1 << 16).decode()
+            return ""
+
+        yield shown
+    os.close(leader)
+
+
+@pytest.fixture
+def large(folder: Path) -> Path:
+    path = folder / "large"
+    with path.open("wb") as stream:
+        stream.truncate(files.PROGRESS_FROM)  # a hole: no disk is filled
+    return path
+
+
+def test_a_large_file_shows_progress_on_a_terminal(large: Path) -> None:
+    with terminal() as shown:
+        pieces = [len(piece) for piece in files.chunks("large")]
+        lines = shown().replace("\r\n", "\n").split("\r")
+    assert pieces == [files.CHUNK] * (files.PROGRESS_FROM // files.CHUNK)
+    assert lines[0] == "" and len(lines) == 1 + len(pieces)
+    assert lines[8] == f"large [{'#' * 20}{'.' * 20}]  50%" and lines[-1] == f"large [{'#' * 40}] 100%\n"
+
+
+def test_a_small_file_shows_none(folder: Path) -> None:
+    with terminal() as shown:
+        assert sum(map(len, files.chunks("message"))) == 1200
+        assert shown() == ""
+
+
+def test_no_progress_goes_into_a_pipe(large: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert sum(map(len, files.chunks("large"))) == files.PROGRESS_FROM
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_file_that_grows_while_it_is_read_stays_at_100_percent(large: Path) -> None:
+    with terminal() as shown:
+        reading = files.chunks("large")
+        next(reading)
+        with large.open("r+b") as stream:
+            stream.truncate(files.PROGRESS_FROM + (2 << 20))
+        assert sum(map(len, reading)) == files.PROGRESS_FROM + (1 << 20)
+        assert shown().count("100%") == 3
+
+
+# --- files ---
+
+
+def test_output_takes_the_mode_that_the_umask_leaves(keys: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        assert main(["pubkey", "--key", "key.pem", "-o", "new.pem"]) == 0
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(os.stat("new.pem").st_mode) == 0o640
+
+
+def test_output_into_a_device_does_not_replace_it(keys: Path, tmp_path: Path) -> None:
+    os.mkfifo("fifo")
+    reader = os.open("fifo", os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        assert main(["pubkey", "--key", "key.pem", "-o", "fifo"]) == 0
+        assert os.read(reader, 1 << 16) == Path("pub.pem").read_bytes()
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(os.stat("fifo").st_mode)
+
+
+def test_a_distinguishing_id_is_the_bytes_of_the_command_line(keys: Path) -> None:
+    """Also where they are no text in the user's encoding."""
+    arguments: list[Any] = [sys.executable, "-m", "smcrypto", "sign", "--key", "key.pem", "-o", "sig", "message"]
+    subprocess.run([*arguments, "--uid", b"robot\xff"], check=True, env=ENVIRONMENT)
+    public = sm2.PublicKey.from_pem(Path("pub.pem").read_bytes())
+    public.verify(Path("sig").read_bytes(), Path("message").read_bytes(), uid=b"robot\xff")

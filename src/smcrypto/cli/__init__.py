@@ -2,12 +2,14 @@
 
 Built on argparse alone. Data goes to stdout or `-o`, talk and progress to
 stderr. Exit codes: 0 done, 1 refused (a signature that does not hold, a
-wrong password, an unreadable file), 2 a command line that makes no sense.
+wrong password, an unreadable file), 2 a command line that makes no sense,
+130 interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
@@ -47,6 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = build_parser().parse_args(arguments)
     try:
         code: int = options.run(options)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Who reads our output has seen enough; what Python would flush at its end goes nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (SMCryptoError, OSError) as error:
         name = getattr(error, "filename", None)
         text = f"{name}: {error.strerror}" if isinstance(error, OSError) and name else str(error)

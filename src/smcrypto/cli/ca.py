@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from smcrypto import pem, sm2, x509
 from smcrypto.cli import passwords
-from smcrypto.cli.files import add_output, read_all, write_output, write_private
-from smcrypto.cli.keys import add_key, load_private
+from smcrypto.cli.files import add_input, add_output, read_all, require_absent, write_output, write_private
+from smcrypto.cli.keys import add_key, add_uid, load_private, uid_bytes
 from smcrypto.errors import CertificateError, InvalidOption
 
 __all__ = ["add_parser"]
@@ -55,7 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     init.add_argument("--path-length", type=int, metavar="N", help="at most N intermediate CAs below (default: any)")
     init.add_argument("--unencrypted", action="store_true", help="write the CA's key without a password")
     init.add_argument("--force", action="store_true", help="overwrite an existing CA")
-    _add_uid(init)
+    add_uid(init)
     passwords.add_arguments(init)
     init.set_defaults(run=run_init)
 
@@ -63,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_key(csr)
     _add_subject(csr)
     _add_names(csr)
-    _add_uid(csr)
+    add_uid(csr)
     add_output(csr)
     csr.set_defaults(run=run_csr)
 
@@ -79,7 +78,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     issue.add_argument("--requested-names", action="store_true",
                        help="also grant the alternative names that the request asks for")
     issue.add_argument("--request-uid", metavar="TEXT", help="distinguishing id of the request (default: --uid)")
-    _add_uid(issue)
+    add_uid(issue)
     add_output(issue)
     issue.set_defaults(run=run_issue)
 
@@ -88,11 +87,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     revoke.add_argument("certificates", nargs="*", type=Path, help="certificates (PEM); none renews the list")
     revoke.add_argument("--reason", default="unspecified", help="as in RFC 5280: keyCompromise, superseded, …")
     _add_days(revoke, 30)
-    _add_uid(revoke)
+    add_uid(revoke)
     revoke.set_defaults(run=run_revoke)
 
     show = commands.add_parser("show", help="print certificates, requests and revocation lists as text")
-    show.add_argument("file", nargs="?", default="-", help="PEM file; '-' or nothing is stdin")
+    add_input(show)
     show.set_defaults(run=run_show)
 
     verify = commands.add_parser("verify", help="exit with 0 where a certificate is to be trusted, with 1 otherwise")
@@ -104,7 +103,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     verify.add_argument("--extended-key-usage", action="append", default=[], metavar="NAME",
                         help="a purpose it must allow: serverAuth, …, or an object identifier")
     verify.add_argument("--key-usage", action="append", default=[], metavar="NAME", help="digitalSignature, …")
-    _add_uid(verify)
+    add_uid(verify)
     verify.set_defaults(run=run_verify)
 
 
@@ -124,11 +123,6 @@ def _add_days(parser: argparse.ArgumentParser, default: int) -> None:
     parser.add_argument("--days", type=int, default=default, help="valid from now for so long (default: %(default)s)")
 
 
-def _add_uid(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--uid", default=sm2.DEFAULT_UID.decode(), metavar="TEXT",
-                        help="distinguishing id of the signatures (default: %(default)s)")
-
-
 def _add_authority(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dir", type=Path, required=True, metavar="DIR", help="the CA's folder")
     passwords.add_arguments(parser)
@@ -143,31 +137,25 @@ def _days(options: argparse.Namespace) -> tuple[datetime, datetime]:
 
 def _authority(options: argparse.Namespace) -> tuple[x509.Certificate, sm2.PrivateKey]:
     certificate = x509.Certificate.from_pem((options.dir / "ca.crt.pem").read_bytes())
-    options.key = options.dir / "ca.key.pem"
-    return certificate, load_private(options)
-
-
-def _one(data: bytes) -> Iterator[bytes]:
-    yield data
+    return certificate, load_private(options.dir / "ca.key.pem", options)
 
 
 def run_init(options: argparse.Namespace) -> int:
     key_file, certificate_file = options.dir / "ca.key.pem", options.dir / "ca.crt.pem"
     for path in (key_file, certificate_file):
-        if path.exists() and not options.force:
-            raise InvalidOption(f"{path} exists; give --force to overwrite the CA")
+        require_absent(path, force=options.force)
     begin, end = _days(options)
     key = sm2.PrivateKey.generate()
     certificate = x509.self_signed(
         key, subject=options.subject, not_before=begin, not_after=end, path_length=options.path_length,
-        uid=options.uid.encode(),
+        uid=uid_bytes(options.uid),
     )  # fmt: skip
     password = None
     if not options.unencrypted:
         password = passwords.read_password(options, "New password for the CA's key", confirm=True)
     options.dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     write_private(key_file, key.to_pem(password=password), force=options.force)
-    write_output(certificate_file, _one(certificate.to_pem()))
+    write_output(certificate_file, [certificate.to_pem()])
     print(f"{certificate_file}: {certificate.subject}, SM3 fingerprint {certificate.fingerprint().hex()}",
           file=sys.stderr)
     return 0
@@ -175,17 +163,16 @@ def run_init(options: argparse.Namespace) -> int:
 
 def run_csr(options: argparse.Namespace) -> int:
     request = x509.CertificateSigningRequest.create(
-        load_private(options), subject=options.subject, subject_alt_names=options.san,
-        extended_key_usage=options.extended_key_usage, uid=options.uid.encode(),
+        load_private(options.key, options), subject=options.subject, subject_alt_names=options.san,
+        extended_key_usage=options.extended_key_usage, uid=uid_bytes(options.uid),
     )  # fmt: skip
-    write_output(options.output, _one(request.to_pem()))
+    write_output(options.output, [request.to_pem()])
     return 0
 
 
 def run_issue(options: argparse.Namespace) -> int:
     request = x509.CertificateSigningRequest.from_pem(read_all(options.request))
-    request_uid = options.uid if options.request_uid is None else options.request_uid
-    request.verify(uid=request_uid.encode())
+    request.verify(uid=uid_bytes(options.uid if options.request_uid is None else options.request_uid))
     ca_certificate, ca_key = _authority(options)
     begin, end = _days(options)
     granted = list(request.subject_alt_names) if options.requested_names else []
@@ -193,10 +180,10 @@ def run_issue(options: argparse.Namespace) -> int:
         request, ca_certificate, ca_key, not_before=begin, not_after=end, ca=options.intermediate,
         path_length=options.path_length, subject_alt_names=list(dict.fromkeys(options.san + granted)),
         extended_key_usage=options.extended_key_usage,
-        key_usage=None if options.intermediate else PURPOSES[options.purpose], uid=options.uid.encode(),
+        key_usage=None if options.intermediate else PURPOSES[options.purpose], uid=uid_bytes(options.uid),
     )  # fmt: skip
-    _require_useful(certificate, ca_certificate, begin, options.uid.encode())
-    write_output(options.output, _one(certificate.to_pem()))
+    _require_useful(certificate, ca_certificate, begin, uid_bytes(options.uid))
+    write_output(options.output, [certificate.to_pem()])
     return 0
 
 
@@ -212,7 +199,7 @@ def _require_useful(certificate: x509.Certificate, ca: x509.Certificate, at: dat
 
 def run_revoke(options: argparse.Namespace) -> int:
     certificate, key = _authority(options)
-    uid = options.uid.encode()
+    uid = uid_bytes(options.uid)
     path = options.dir / "ca.crl.pem"
     entries: list[x509.RevokedCertificate] = []
     number = 0
@@ -230,7 +217,7 @@ def run_revoke(options: argparse.Namespace) -> int:
     crl = x509.CertificateRevocationList.create(
         certificate, key, revoked=entries, this_update=begin, next_update=end, number=number, uid=uid
     )
-    write_output(path, _one(crl.to_pem()))
+    write_output(path, [crl.to_pem()])
     print(f"{path}: {len(entries)} revoked, valid until {end}", file=sys.stderr)
     return 0
 
@@ -245,7 +232,7 @@ def run_verify(options: argparse.Namespace) -> int:
             intermediates=rest,
             roots=x509.load_pem_certificates(options.roots.read_bytes()),
             at=_moment(options.at),
-            uid=options.uid.encode(),
+            uid=uid_bytes(options.uid),
             extended_key_usage=options.extended_key_usage,
             key_usage=options.key_usage,
             crls=[x509.CertificateRevocationList.from_pem(file.read_bytes()) for file in options.crl],

@@ -3,14 +3,16 @@
 The three forms are those of the openssl command line, so either side reads
 the other: `pkeyutl -encrypt` (GM/T 0009), `enc -sm4-MODE -pbkdf2 -md sm3`
 (the eight bytes "Salted__", a salt of eight, the ciphertext), and
-`enc -sm4-MODE -K -iv`. Only the first notices tampering.
+`enc -sm4-MODE -K -iv`. Only the first notices tampering: sign what the others
+carry. SM2 encrypts a key or a letter; it holds the whole file in memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 
 from smcrypto import kdf, sm4
@@ -18,11 +20,10 @@ from smcrypto.cli import passwords
 from smcrypto.cli.files import add_input, add_output, chunks, read_all, write_output
 from smcrypto.cli.keys import load_private, load_public
 from smcrypto.errors import InvalidCiphertext, InvalidOption
-from smcrypto.sm4.modes import Mode
 
 __all__ = ["add_parser"]
 
-MODES: dict[str, Callable[[bytes], Mode]] = {
+MODES: dict[str, Callable[[bytes], sm4.Mode]] = {
     "cbc": sm4.CBC, "ctr": sm4.CTR, "cfb": sm4.CFB, "ofb": sm4.OFB,
 }
 MAGIC = b"Salted__"
@@ -57,13 +58,24 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     add_input(parser)
 
 
+def _require_one_secret(options: argparse.Namespace, key_file: Path | None, name: str) -> None:
+    """What would be ignored is refused: of an SM2 key, a password and an SM4 key there is one."""
+    if options.sm4_key_file is None:
+        if options.iv is not None:
+            raise InvalidOption("--iv belongs to --sm4-key-file")
+    elif key_file is not None or passwords.named(options):
+        raise InvalidOption(f"--sm4-key-file goes with neither {name} nor a password")
+    elif options.iv is None:
+        raise InvalidOption("--sm4-key-file needs --iv")
+
+
 def _cipher(key: bytes, iv: bytes, options: argparse.Namespace) -> sm4.Cipher:
     return sm4.Cipher(key, MODES[options.mode](iv), padding="pkcs7" if options.mode == "cbc" else None)
 
 
 def _explicit(options: argparse.Namespace) -> tuple[bytes, bytes]:
     try:
-        iv = bytes.fromhex(options.iv or "")
+        iv = bytes.fromhex(options.iv)
     except ValueError:
         raise InvalidOption("--iv must be hex") from None
     return options.sm4_key_file.read_bytes(), iv
@@ -75,16 +87,19 @@ def _from_password(password: bytes, salt: bytes, options: argparse.Namespace) ->
     return derived[:16], derived[16:]
 
 
-def _streamed(context: sm4.CipherStream, pieces: Iterator[bytes]) -> Iterator[bytes]:
+def _streamed(context: sm4.CipherStream, pieces: Iterable[bytes]) -> Iterator[bytes]:
     for piece in pieces:
         yield context.update(piece)
     yield context.finalize()
 
 
 def run_encrypt(options: argparse.Namespace) -> int:
+    _require_one_secret(options, options.to, "--to")
     if options.to is not None:
+        if passwords.named(options):
+            raise InvalidOption("--to goes without a password")
         sealed = load_public(options.to).encrypt(read_all(options.file), encoding=options.encoding)
-        write_output(options.output, iter([sealed]))
+        write_output(options.output, [sealed])
         return 0
     head = b""
     if options.sm4_key_file is not None:
@@ -93,36 +108,26 @@ def run_encrypt(options: argparse.Namespace) -> int:
         salt = secrets.token_bytes(SALT_SIZE)
         key, iv = _from_password(passwords.read_password(options, "New password", confirm=True), salt, options)
         head = MAGIC + salt
-
-    def output() -> Iterator[bytes]:
-        yield head
-        yield from _streamed(_cipher(key, iv, options).encryptor(), chunks(options.file))
-
-    write_output(options.output, output())
+    body = _streamed(_cipher(key, iv, options).encryptor(), chunks(options.file))
+    write_output(options.output, chain([head], body))
     return 0
 
 
 def run_decrypt(options: argparse.Namespace) -> int:
+    _require_one_secret(options, options.key, "--key")
     if options.key is not None:
-        message = load_private(options).decrypt(read_all(options.file), encoding=options.encoding)
-        write_output(options.output, iter([message]))
+        message = load_private(options.key, options).decrypt(read_all(options.file), encoding=options.encoding)
+        write_output(options.output, [message])
         return 0
     pieces = chunks(options.file)
     if options.sm4_key_file is not None:
         key, iv = _explicit(options)
     else:
-        head = b""
-        while len(head) < len(MAGIC) + SALT_SIZE and (piece := next(pieces, b"")):
-            head += piece
-        magic, salt, rest = head[:8], head[8:16], head[16:]
+        first = next(pieces, b"")  # CHUNK bytes, or all there is
+        magic, salt, rest = first[:8], first[8:16], first[16:]
         if magic != MAGIC or len(salt) != SALT_SIZE:
             raise InvalidCiphertext("not encrypted under a password: the file does not begin with 'Salted__'")
         key, iv = _from_password(passwords.read_password(options, "Password"), salt, options)
-        pieces = _preceded(rest, pieces)
+        pieces = chain([rest], pieces)
     write_output(options.output, _streamed(_cipher(key, iv, options).decryptor(), pieces))
     return 0
-
-
-def _preceded(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
-    yield first
-    yield from rest

@@ -8,13 +8,13 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from smcrypto.errors import InvalidOption
 
-__all__ = ["CHUNK", "add_input", "add_output", "chunks", "read_all", "write_output", "write_private"]
+__all__ = ["CHUNK", "add_input", "add_output", "chunks", "read_all", "require_absent", "write_output", "write_private"]
 
 CHUNK = 1 << 20
 PROGRESS_FROM = 16 << 20  # smaller files are done before a bar could be read
@@ -30,6 +30,7 @@ def add_output(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def _opened(name: str) -> Iterator[tuple[BinaryIO, int]]:
+    """The input and its size, 0 where that cannot be known before."""
     if name == "-":
         yield sys.stdin.buffer, 0
         return
@@ -47,9 +48,10 @@ def chunks(name: str) -> Iterator[bytes]:
             yield chunk
             done += len(chunk)
             if bar:
-                filled = 40 * done // size
-                print(f"\r{name} [{'#' * filled}{'.' * (40 - filled)}] {100 * done // size:3d} %",
-                      end="", file=sys.stderr, flush=True)
+                share = min(done / size, 1.0)  # the file may grow while it is read
+                filled = int(40 * share)
+                drawn = f"[{'#' * filled}{'.' * (40 - filled)}]"
+                print(f"\r{name} {drawn} {share:4.0%}", end="", file=sys.stderr, flush=True)
         if bar:
             print(file=sys.stderr)
 
@@ -58,8 +60,14 @@ def read_all(name: str) -> bytes:
     return b"".join(chunks(name))
 
 
-def write_output(path: Path | None, pieces: Iterator[bytes]) -> None:
-    """Write the pieces to stdout, or to `path` under a temporary name that is renamed when all is well.
+def require_absent(path: Path, *, force: bool) -> None:
+    """InvalidOption if there is such a file already, unless `force`."""
+    if path.exists() and not force:
+        raise InvalidOption(f"{path} exists; give --force to overwrite it")
+
+
+def write_output(path: Path | None, pieces: Iterable[bytes]) -> None:
+    """Write the pieces to stdout, or to `path` at once when all of them are there.
 
     So a decryption that fails at its end leaves no half-written plaintext behind in a file.
     """
@@ -68,25 +76,30 @@ def write_output(path: Path | None, pieces: Iterator[bytes]) -> None:
             sys.stdout.buffer.write(piece)
         sys.stdout.buffer.flush()
         return
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            for piece in pieces:
-                stream.write(piece)
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink()
-        raise
+    umask = os.umask(0)
+    os.umask(umask)
+    _write_whole(path, pieces, mode=0o666 & ~umask)
 
 
 def write_private(path: Path, data: bytes, *, force: bool = False) -> None:
     """Write a key file that only its owner can read (0600); an existing file is kept unless `force`."""
-    if path.exists() and not force:
-        raise InvalidOption(f"{path} exists; give --force to overwrite it")
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")  # created 0600
-    with os.fdopen(descriptor, "wb") as stream:
-        stream.write(data)
-    Path(temporary).replace(path)
+    require_absent(path, force=force)
+    _write_whole(path, [data], mode=0o600)
+
+
+def _write_whole(path: Path, pieces: Iterable[bytes], *, mode: int) -> None:
+    """Write under a temporary name, readable by the owner alone, and rename when all is well."""
+    if path.exists() and not path.is_file():  # /dev/null, a pipe: not to be replaced by a file
+        with path.open("wb") as device:
+            device.writelines(pieces)
+        return
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.writelines(pieces)
+        temporary.chmod(mode)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink()
+        raise

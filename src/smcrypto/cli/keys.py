@@ -1,15 +1,16 @@
-"""`keygen` and `pubkey`: SM2 key files that openssl reads, and reading those it writes."""
+"""`keygen` and `pubkey`: SM2 key files that openssl reads; and the arguments by which commands name keys."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 
 from smcrypto import sm2
 from smcrypto.cli import passwords
-from smcrypto.cli.files import add_output, write_output, write_private
+from smcrypto.cli.files import add_output, require_absent, write_output, write_private
 
-__all__ = ["add_key", "add_parser", "add_public", "load_private", "load_public"]
+__all__ = ["add_key", "add_parser", "add_public", "add_uid", "load_private", "load_public", "uid_bytes"]
 
 _ENCRYPTED = b"ENCRYPTED PRIVATE KEY"
 
@@ -20,8 +21,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         description="Make an SM2 key pair; the private key file is readable by its owner alone.")
     keygen.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the private key (PEM)")
     keygen.add_argument("--public", type=Path, metavar="FILE", help="write the public key (PEM) here too")
-    keygen.add_argument("--format", choices=("pkcs8", "sec1"), default="pkcs8")
-    keygen.add_argument("--encrypt", action="store_true", help="encrypt the private key under a password")
+    keygen.add_argument("--format", choices=("pkcs8", "sec1"), default="pkcs8", help="default: %(default)s")
+    keygen.add_argument("--encrypt", action="store_true",
+                        help="encrypt the private key under a password, asked for unless an option names it")
     keygen.add_argument("--force", action="store_true", help="overwrite an existing private key")
     passwords.add_arguments(keygen)
     keygen.set_defaults(run=run_keygen)
@@ -42,11 +44,20 @@ def add_public(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--public", type=Path, required=True, metavar="FILE", help="public key (PEM)")
 
 
-def load_private(options: argparse.Namespace) -> sm2.PrivateKey:
-    data = options.key.read_bytes()
-    password = None
-    if _ENCRYPTED in data:
-        password = passwords.read_password(options, f"Password for {options.key}")
+def add_uid(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--uid", default=sm2.DEFAULT_UID.decode(), metavar="TEXT",
+                        help="the signer's distinguishing id (default: %(default)s)")
+
+
+def uid_bytes(text: str) -> bytes:
+    """A distinguishing id as it stood on the command line, byte for byte."""
+    return os.fsencode(text)
+
+
+def load_private(path: Path, options: argparse.Namespace) -> sm2.PrivateKey:
+    """The key in a file; the password, where it is encrypted, comes from what `options` name."""
+    data = path.read_bytes()
+    password = passwords.read_password(options, f"Password for {path}") if _ENCRYPTED in data else None
     return sm2.PrivateKey.from_pem(data, password=password)
 
 
@@ -55,15 +66,16 @@ def load_public(path: Path) -> sm2.PublicKey:
 
 
 def run_keygen(options: argparse.Namespace) -> int:
+    require_absent(options.output, force=options.force)  # before a password is asked for
+    wanted = options.encrypt or passwords.named(options)
+    password = passwords.read_password(options, "New password", confirm=True) if wanted else None
     key = sm2.PrivateKey.generate()
-    wants_password = options.encrypt or options.password_file or options.password_env
-    password = passwords.read_password(options, "New password", confirm=True) if wants_password else None
     write_private(options.output, key.to_pem(password=password, format=options.format), force=options.force)
     if options.public is not None:
-        write_output(options.public, iter([key.public_key.to_pem()]))
+        write_output(options.public, [key.public_key.to_pem()])
     return 0
 
 
 def run_pubkey(options: argparse.Namespace) -> int:
-    write_output(options.output, iter([load_private(options).public_key.to_pem()]))
+    write_output(options.output, [load_private(options.key, options).public_key.to_pem()])
     return 0

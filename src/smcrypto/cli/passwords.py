@@ -14,7 +14,7 @@ from pathlib import Path
 
 from smcrypto.errors import InvalidKey
 
-__all__ = ["add_arguments", "read_password"]
+__all__ = ["add_arguments", "named", "read_password"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="read the password from FILE's first line")
     group.add_argument("--password-env", metavar="NAME",
                        help="read the password from the environment variable NAME")
+
+
+def named(options: argparse.Namespace) -> bool:
+    """Whether the options say where the password is."""
+    return options.password_file is not None or options.password_env is not None
 
 
 def read_password(options: argparse.Namespace, prompt: str, *, confirm: bool = False) -> bytes:
@@ -40,8 +45,8 @@ def read_password(options: argparse.Namespace, prompt: str, *, confirm: bool = F
     else:
         if not sys.stdin.isatty():
             raise InvalidKey("a password is needed: give --password-file or --password-env")
-        password = getpass.getpass(f"{prompt}: ").encode()
-        if confirm and getpass.getpass(f"{prompt} (again): ").encode() != password:
+        password = os.fsencode(getpass.getpass(f"{prompt}: "))
+        if confirm and os.fsencode(getpass.getpass(f"{prompt} (again): ")) != password:
             raise InvalidKey("the two passwords differ")
         origin = "the prompt"
     if not password:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from smcrypto import sm2
 from smcrypto.cli.files import add_input, add_output, chunks, write_output
-from smcrypto.cli.keys import add_key, add_public, load_private, load_public
+from smcrypto.cli.keys import add_key, add_public, add_uid, load_private, load_public, uid_bytes
 from smcrypto.errors import InvalidSignature
 
 __all__ = ["add_parser"]
@@ -32,24 +32,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--uid", default=sm2.DEFAULT_UID.decode(),
-                        help="the signer's distinguishing id (default: %(default)s)")
+    add_uid(parser)
     parser.add_argument("--encoding", choices=("der", "raw"), default="der",
                         help="der: GM/T 0009, as openssl; raw: r and s, 64 bytes (default: %(default)s)")
 
 
 def _digest(public_key: sm2.PublicKey, options: argparse.Namespace) -> bytes:
     """e = SM3(Z_A || M), GB/T 32918.2, 6.1 A1 and A2, without holding M in memory."""
-    state = public_key.hasher(uid=options.uid.encode())
+    state = public_key.hasher(uid=uid_bytes(options.uid))
     for chunk in chunks(options.file):
         state.update(chunk)
     return state.digest()
 
 
 def run_sign(options: argparse.Namespace) -> int:
-    key = load_private(options)
+    key = load_private(options.key, options)
     signature = key.sign_digest(_digest(key.public_key, options), encoding=options.encoding)
-    write_output(options.output, iter([signature]))
+    write_output(options.output, [signature])
     return 0
 
 
