@@ -70,11 +70,15 @@ def comparisons(found: Sequence[Timing]) -> list[Comparison]:
 
 
 def duration(seconds: float) -> str:
-    """Three significant digits with the unit that suits: '85.1 µs', '3.40 s'."""
+    """Three significant digits with the unit that suits.
+
+    >>> duration(8.51e-5), duration(3.4), duration(0.25)
+    ('85.1 µs', '3.40 s', '250 ms')
+    """
     units = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
     unit, scale = next((entry for entry in units if seconds >= entry[1]), units[-1])
     value = seconds / scale
-    return f"{value:.0f} {unit}" if value >= 100 else f"{value:.3g} {unit}"
+    return f"{value:.0f} {unit}" if value >= 99.95 else f"{value:#.3g} {unit}"
 
 
 def rate(timing: Timing) -> str:
@@ -144,15 +148,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         report = json.loads(options.results.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        print(f"cannot read {options.results}: {error}; run `pytest benchmarks/` first", file=sys.stderr)
+        table = markdown(report)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        print(f"cannot read {options.results}: {error!r}; run `pytest benchmarks/` first", file=sys.stderr)
         return 1
-    if options.picture is not None:
-        picture(report, options.picture)
-    if options.markdown is not None:
-        options.markdown.write_text(markdown(report), encoding="utf-8")
-    else:
-        print(markdown(report), end="")
+    try:
+        if options.picture is not None:
+            picture(report, options.picture)
+        if options.markdown is not None:
+            options.markdown.write_text(table, encoding="utf-8")
+        else:
+            print(table, end="")
+    except (OSError, MissingDependency) as error:
+        print(f"smcrypto.bench: {error}", file=sys.stderr)
+        return 1
     return 0
 
 
