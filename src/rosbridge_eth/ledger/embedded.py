@@ -11,6 +11,7 @@ a fee below the base fee waits, what cannot be paid for is refused.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -66,6 +67,7 @@ class EmbeddedChain:
         clock: Callable[[], float] = time.time,
         block_gas_limit: int = BLOCK_GAS_LIMIT,
     ) -> None:
+        recursion_limit = sys.getrecursionlimit()
         from eth.chains.base import MiningChain
         from eth.constants import POST_MERGE_DIFFICULTY, POST_MERGE_MIX_HASH, POST_MERGE_NONCE
         from eth.db.atomic import AtomicDB
@@ -73,6 +75,9 @@ class EmbeddedChain:
         from eth_keys.datatypes import PrivateKey
         from eth_utils.address import to_canonical_address
 
+        # py-evm raises the limit of the whole process so far that deeply nested JSON would overflow the C stack.
+        # It wants it for calls within calls 1,024 deep; the contract here makes none.
+        sys.setrecursionlimit(recursion_limit)
         chain_class: Any = MiningChain.configure(
             __name__="EmbeddedChain", vm_configuration=((0, PragueVM),), chain_id=CHAIN_ID
         )

@@ -57,9 +57,10 @@ def pump(submitter: Submitter, chain: Chain, now: float, *, clock: Callable[[], 
     """Do all that can be done at `now`; how many questions it took.
 
     clock: read as each answer comes, so that latencies count the node's time;
-    without it every answer counts as of `now`.
+    without it every answer counts as of `now`. What becomes due meanwhile is
+    left for the next call, or a slow node would never let this one end.
     """
-    asked = 0
+    asked, answered_at = 0, now
     for _ in range(MAX_ROUNDS):
         actions = submitter.actions(now)
         if not actions:
@@ -67,8 +68,8 @@ def pump(submitter: Submitter, chain: Chain, now: float, *, clock: Callable[[], 
         for action in actions:
             answer = perform(chain, action)
             if clock is not None:
-                now = max(now, clock())  # a wall clock that is set back must not undo what was timed
-            submitter.handle(action, answer, now)
+                answered_at = max(answered_at, clock())  # a wall clock may be set back
+            submitter.handle(action, answer, answered_at)
         asked += len(actions)
     return asked
 
@@ -84,7 +85,7 @@ def run(
     """Pump until `stop` is set; `wake` cuts a pause short, for instance when something was sealed."""
     pause = wake or stop
     while not stop.is_set():
-        pump(submitter, chain, clock(), clock=clock)
+        pump(submitter, chain, clock())
         now = clock()
         if pause.wait(max(0.0, min(submitter.next_timer(now) - now, LONGEST_PAUSE))) and pause is not stop:
             pause.clear()

@@ -798,6 +798,7 @@ class Submitter:
                 mined, overtaken = self._journal.mined(job, receipt, lease, now)
                 self._keep(mined, *overtaken)
                 self._waits.pop(account, None)
+                self._blocks_checked.pop(receipt.block_number, None)  # there is something new in it
         elif nonce < view.deep_nonce:
             # Not before it is final: until then a reorganisation could still make it succeed.
             reason = f"transaction 0x{receipt.tx_hash.hex()} reverted in block {receipt.block_number}"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import threading
 from collections import Counter
 from pathlib import Path
 
@@ -24,7 +27,7 @@ from rosbridge_eth.ledger.chain import Call
 from rosbridge_eth.ledger.contract import calldata
 from rosbridge_eth.ledger.history import fetch
 from rosbridge_eth.ledger.journal import Binding, Journal
-from rosbridge_eth.ledger.pump import pump
+from rosbridge_eth.ledger.pump import pump, run
 from rosbridge_eth.ledger.recovery import adopt_history, missing_batches
 from rosbridge_eth.ledger.states import SETTLED, Kind
 from rosbridge_eth.ledger.submitter import Settings, Submitter
@@ -242,3 +245,43 @@ def test_a_revoked_robots_batches_wait_until_it_is_registered_again(made: Ledger
     drive(made, submitter)
     assert [item.record for item in fetch(made.chain, made.contract, ROBOT).records] == given
     assert journal.dead_letters() == []
+
+
+def test_a_chain_that_mines_only_when_it_must_is_enough(made: Ledger, records: Records):
+    submitter, _ = submitter_for(made, confirmations=1, poll=0.01, max_in_flight=2)
+    given = records.run(60)
+    submitter.seal(given, made.clock.now)
+    for _ in range(300):  # no block is mined here but those the transactions bring
+        pump(submitter, made.chain, made.clock.now)
+        made.clock.now += 0.02
+    assert submitter.idle()
+    assert [item.record for item in fetch(made.chain, made.contract, ROBOT).records] == given
+
+
+def test_a_thread_pumps_until_it_is_stopped_and_gives_its_leases_back(made: Ledger, records: Records):
+    submitter, journal = submitter_for(made, confirmations=1, poll=0.01)
+    given = records.run(12)
+    submitter.seal(given, made.clock.now)
+    stop = threading.Event()
+
+    def clock() -> float:
+        made.clock.now += 0.1
+        if submitter.idle():
+            stop.set()
+        return made.clock.now
+
+    thread = threading.Thread(target=run, args=(submitter, made.chain, stop), kwargs={"clock": clock})
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive()
+    assert [item.record for item in fetch(made.chain, made.contract, ROBOT).records] == given
+    assert journal.lease(ACCOUNT.address, "another", made.clock.now, 1.0) is not None
+
+
+def test_the_process_keeps_its_recursion_limit() -> None:
+    script = (
+        "import json, sys; before = sys.getrecursionlimit();"
+        "from rosbridge_eth.ledger.embedded import EmbeddedChain; EmbeddedChain();"
+        "assert sys.getrecursionlimit() == before"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True)
