@@ -161,7 +161,8 @@ def test_a_real_run_is_read(tmp_path: Path) -> None:
         [sys.executable, "-m", "pytest", str(ROOT / "benchmarks" / "bench_sm3.py"), "-q", "-k", "digest and 64",
          "--benchmark-max-time=0.01", "--benchmark-min-rounds=1", "--benchmark-warmup=off", "-p", "no:xdist",
          "-p", "no:cacheprovider", f"--benchmark-json={path}"],
-        check=True, capture_output=True, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(Path(smcrypto.__file__).parents[1]), "PYTEST_ADDOPTS": ""},
+        check=True, capture_output=True, cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(Path(smcrypto.__file__).parents[1]), "PYTEST_ADDOPTS": ""},
     )  # fmt: skip
     found = bench.comparisons(bench.timings(json.loads(path.read_text())))
     assert found and all(comparison.ours.median > 0 for comparison in found)
