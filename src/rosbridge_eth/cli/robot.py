@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 from types import FrameType
@@ -16,6 +17,14 @@ from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import RobotHome
 from rosbridge_eth.passphrases import read_passphrase
+
+SOURCES = {
+    "bag": "a bag",
+    "ros1": "the live ROS 1 graph",
+    "ros2": "the live ROS 2 graph",
+    "sim": "a SIMULATED robot",
+}
+"""Kinds of source, as a person is told of them."""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -57,6 +66,8 @@ def robot(
     place = RobotHome(home)
     end = place.bridge()
     settings = load_robot_config(config or place.config)
+    source, why = settings.source_and_why(os.environ)
+    talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
     running = open_robot(place, settings, read_passphrase("robot", f"Password of {end.robot}", file=password_file))
 
     def stop(number: int, frame: FrameType | None) -> None:

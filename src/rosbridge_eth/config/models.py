@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 from urllib.parse import urlsplit
@@ -16,8 +17,11 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Dis
 from rosbridge_eth.capture import NamePattern, TopicRule
 from rosbridge_eth.capture.paths import parse_paths
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, Seconds, Size, TimeNs
-from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.errors import ConfigError, SourceError
 from rosbridge_eth.sources import BagSettings, Selection, SimSettings
+from rosbridge_eth.sources.ros1 import Ros1Settings
+from rosbridge_eth.sources.ros1.addressing import MASTER_PORT, is_graph_name, is_host, read_uri
+from rosbridge_eth.sources.ros2 import Ros2Settings
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
 SECOND_NS = 10**9
@@ -62,10 +66,37 @@ def _topic_part(value: str) -> str:
     return value
 
 
+def _ros_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_](?:_?[A-Za-z0-9])*_?", value, re.ASCII) or len(value) > 255:
+        raise ValueError(f"is {value!r}; a node's name has letters, digits and single _, and no digit in front")
+    return value
+
+
 def _contract(value: str) -> str:
     if not re.fullmatch(r"0x[0-9a-fA-F]{40}", value, re.ASCII):
         raise ValueError(f"is {value!r}; an address is 0x and 40 hexadecimal digits")
     return value
+
+
+def _master(value: str) -> str:
+    try:
+        read_uri(value, MASTER_PORT)
+    except SourceError:
+        raise ValueError(f'is {value!r}; write the master\'s URI, such as "http://192.0.2.7:11311"') from None
+    return value
+
+
+def _host(value: str) -> str:
+    if not is_host(value):
+        raise ValueError(f"is {value!r}; write a name or an address, without a port")
+    return value
+
+
+def _node(value: str) -> str:
+    name = value if value.startswith("/") else f"/{value}"
+    if not is_graph_name(name):
+        raise ValueError(f'is {value!r}; a node\'s name has letters, digits, _ and /, such as "/robot_1/recorder"')
+    return name
 
 
 Pattern: TypeAlias = Annotated[str, AfterValidator(_pattern)]
@@ -156,10 +187,29 @@ class BagConfig(Section):
         return BagSettings(self.path, self.speed, self.start or 0, self.stop)
 
 
-class SimConfig(Section):
-    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`; the default, so that anything can be tried."""
+class Ros2Config(Section):
+    """The live ROS 2 graph, through the rclpy of the Python that runs the robot."""
 
-    kind: Literal["sim"] = Field(default="sim", description="`sim`")
+    kind: Literal["ros2"] = Field(description="`ros2`")
+    domain: int | None = Field(
+        default=None, ge=0, le=232, description="The graph's domain; without it, that of `ROS_DOMAIN_ID`, or 0."
+    )
+    node: Annotated[str, AfterValidator(_ros_name)] = Field(
+        default="rosbridge_eth", description="The name under which the robot appears in the graph."
+    )
+    depth: int = Field(
+        default=256, ge=1, le=65_536, description="Messages of a topic that the middleware keeps until they are taken."
+    )
+
+    def settings(self) -> Ros2Settings:
+        """For sources.open_source."""
+        return Ros2Settings(self.domain, self.node, self.depth)
+
+
+class SimConfig(Section):
+    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`, so that anything can be tried."""
+
+    kind: Literal["sim"] = Field(description="`sim`")
     robot: Annotated[str, AfterValidator(_topic_part)] = Field(default="robot_1", description="The NAME in its topics.")
     seed: int = Field(default=1, ge=0, lt=2**63, description="The same seed drives the same way.")
     rate: float = Field(default=10.0, gt=0, le=10_000, description="Odometry and IMU messages per second.")
@@ -171,23 +221,44 @@ class SimConfig(Section):
         return SimSettings(self.robot, self.seed, self.rate, self.duration, self.speed)
 
 
-SOURCE_KINDS: dict[str, type[BagConfig | SimConfig]] = {"bag": BagConfig, "sim": SimConfig}
+SOURCE_KINDS: dict[str, type[BagConfig | Ros2Config | SimConfig]] = {
+    "bag": BagConfig,
+    "ros2": Ros2Config,
+    "sim": SimConfig,
+}
 
 
 def _known_kind(value: Any) -> Any:
     if isinstance(value, dict):
-        kind = value.get("kind", "sim")
+        kind = value.get("kind")
+        if kind is None:
+            raise ValueError(f"has no kind; allowed: {', '.join(map(repr, SOURCE_KINDS))}")
         if kind not in SOURCE_KINDS:
             near = difflib.get_close_matches(str(kind), SOURCE_KINDS, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"has kind {kind!r}; allowed: {', '.join(map(repr, SOURCE_KINDS))}{hint}")
-        return {"kind": kind, **value}
-    if not isinstance(value, Section):
+    elif value is not None and not isinstance(value, Section):
         raise ValueError(f'is {value!r}; write a table, such as [source] with kind = "bag"')
     return value
 
 
-SourceConfig: TypeAlias = Annotated[BagConfig | SimConfig, Discriminator("kind"), BeforeValidator(_known_kind)]
+AnySource: TypeAlias = BagConfig | Ros2Config | SimConfig
+SourceConfig: TypeAlias = Annotated[AnySource, Discriminator("kind")]
+_ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
+
+
+def source_of_environment(environment: Mapping[str, str]) -> tuple[AnySource, str]:
+    """The source of a robot that is configured with none: the ROS that is set up there, or a simulation; and why."""
+    version, distribution = environment.get("ROS_VERSION"), environment.get("ROS_DISTRO")
+    if version in ("1", "2"):
+        kind, why = f"ros{version}", f"ROS_VERSION is {version}"
+    elif master := environment.get("ROS_MASTER_URI"):
+        kind, why = "ros1", f"ROS_MASTER_URI is {master}"
+    elif distribution:
+        kind, why = "ros1" if distribution in _ROS1_DISTRIBUTIONS else "ros2", f"ROS_DISTRO is {distribution}"
+    else:
+        kind, why = "sim", "there is no [source] and no ROS in the environment: nothing real is recorded"
+    return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
 
 
 class SpoolConfig(Section):
@@ -236,7 +307,11 @@ class RobotConfig(Section):
         default="stored",
         description="When a reliable record may leave the spool: stored durably by the server, or confirmed on chain.",
     )
-    source: SourceConfig = Field(default=SimConfig(), description="Where messages come from (below).")
+    source: Annotated[SourceConfig | None, BeforeValidator(_known_kind)] = Field(
+        default=None,
+        description="Where messages come from (below). Without it, the ROS that the environment speaks of "
+        "(`ROS_VERSION`, `ROS_MASTER_URI`, `ROS_DISTRO`), and where it speaks of none, a simulated robot.",
+    )
     capture: CaptureConfig = Field(default=CaptureConfig(), description="Defaults for all topics (below).")
     spool: SpoolConfig = Field(default=SpoolConfig(), description="Records not acknowledged yet (below).")
     stream: StreamConfig = Field(default=StreamConfig(), description="Change of keys (below).")
@@ -277,6 +352,12 @@ class RobotConfig(Section):
             )
             for topic in topics
         ]
+
+    def source_and_why(self, environment: Mapping[str, str]) -> tuple[AnySource, str]:
+        """Where messages come from, as configured or else as `environment` says, and the reason for a person."""
+        if self.source is not None:
+            return self.source, "as configured"
+        return source_of_environment(environment)
 
     def selection(self) -> Selection:
         """For sources.open_source."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from functools import partial
@@ -94,7 +95,8 @@ def open_robot(
     if config.name is not None and config.name != identity.name:
         raise ConfigError(f"name is {config.name!r}, but this home's certificate says {identity.name!r}; drop the key")
     readers = reader_keys(config, home, roots)
-    source = open_source(config.source.settings(), config.selection())
+    source_config, _ = config.source_and_why(os.environ)
+    source = open_source(source_config.settings(), config.selection())
     capture = Capture(config.rules())
     for topic, decoders in source.decoders().items():
         for decoder in decoders:

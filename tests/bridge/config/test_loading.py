@@ -19,6 +19,7 @@ from rosbridge_eth.config import (
     require_file,
     require_private,
 )
+from rosbridge_eth.config.models import SOURCE_KINDS
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.sources import BagSettings, SimSettings
 
@@ -37,8 +38,31 @@ def server(text: str) -> ServerConfig:
 def test_one_line_is_a_whole_configuration():
     config = robot('topics = ["/robot_1/odom"]')
     assert config.rules() == [TopicRule("/robot_1/odom")]
-    assert config.source.settings() == SimSettings()
+    assert config.source is None
     assert config.channel == "exchange"
+
+
+@pytest.mark.parametrize(
+    ("environment", "kind", "reason"),
+    [
+        ({}, "sim", "nothing real is recorded"),
+        ({"ROS_VERSION": "1"}, "ros1", "ROS_VERSION is 1"),
+        ({"ROS_VERSION": "2", "ROS_MASTER_URI": "http://robot:11311"}, "ros2", "ROS_VERSION is 2"),
+        ({"ROS_MASTER_URI": "http://robot:11311"}, "ros1", "ROS_MASTER_URI is http://robot:11311"),
+        ({"ROS_DISTRO": "kilted"}, "ros2", "ROS_DISTRO is kilted"),
+        ({"ROS_DISTRO": "noetic"}, "ros1", "ROS_DISTRO is noetic"),
+    ],
+)
+def test_without_a_source_the_environment_says_which(environment, kind, reason):
+    source, why = robot('topics = ["/robot_1/odom"]').source_and_why(environment)
+    assert source.settings().kind == kind
+    assert reason in why
+
+
+def test_a_source_that_is_configured_is_not_overruled_by_the_environment():
+    config = robot('topics = ["/a"]\n[source]\nkind = "sim"')
+    assert config.source_and_why({"ROS_VERSION": "2"}) == (config.source, "as configured")
+    assert config.source.settings() == SimSettings()
 
 
 def test_topics_are_names_or_tables():
@@ -76,13 +100,14 @@ def test_a_bag_stands_relative_to_the_file():
     assert config.source.settings() == BagSettings(Path("/x/y.bag"), 2.0, 0, None)
 
 
+KINDS = ", ".join(map(repr, SOURCE_KINDS))
 MISTAKES = {
     # The line, the key, what was given, what is allowed, and the nearest right word.
     'topcs = ["/a"]': "line 1: unknown key 'topcs'; did you mean 'topics'?",
     'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "line 4: unknown key 'max_sise' in spool; did you mean 'max_size'?",
     'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: acknowledge, capture, channel, name, nodes, ",
     'topics = [{topic = "/a", rat = 1}]': "line 1: unknown key 'rat' in topics[0]; did you mean 'rate'?",
-    'topics = ["/a"]\nsource.sped = 1': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
+    'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
     "topics = []": "it names nothing to watch",
     'topics = "/a"': "line 1: topics is '/a'; it should be a list in [ ]",
@@ -110,15 +135,18 @@ MISTAKES = {
     'topics = [{topic = "/a", from = 2026-01-02T00:00:00}]': "say in which time zone",
     'topics = [{topic = "/a", for = 5}]': 'topics[0].for is 5; write a duration with its unit, such as "250ms"',
     'topics = ["/a"]\nsource = 3': "line 2: source is 3; write a table",
-    'topics = ["/a"]\n[source]\nkind = "bog"': "source has kind 'bog'; allowed: 'bag', 'sim'; did you mean 'bag'?",
-    'topics = ["/a"]\n[source]\nkind = 1': "source has kind 1; allowed: 'bag', 'sim'",
+    'topics = ["/a"]\n[source]\nkind = "bog"': f"source has kind 'bog'; allowed: {KINDS}; did you mean 'bag'?",
+    'topics = ["/a"]\n[source]\nspeed = "max"': f"source has no kind; allowed: {KINDS}",
+    'topics = ["/a"]\n[source]\nkind = "ros2"\nnode = "a/b"': "source.node is 'a/b'; a node's name has letters",
+    'topics = ["/a"]\n[source]\nkind = "ros2"\ndomain = 233': "line 4: source.domain is 233; it should be at most 232",
+    'topics = ["/a"]\n[source]\nkind = 1': f"source has kind 1; allowed: {KINDS}",
     'topics = ["/a"]\n[source]\nkind = "bag"': "source.path is missing",
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = 5': "line 4: source.path is 5; write a path in quotes",
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nspeed = 0': (
         'line 5: source.speed is 0; write a factor above 0, such as 1.0 or 10, or "max"'
     ),
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nstart = "5s"\nstop = "2s"': "source ends before it begins",
-    'topics = ["/a"]\n[source]\nrobot = "a/b"': "source.robot is 'a/b'; it becomes part of a topic's name",
+    'topics = ["/a"]\n[source]\nkind = "sim"\nrobot = "a/b"': "source.robot is 'a/b'; it becomes part of a topic's",
     'topics = ["/a"]\n[spool]\nmax_size = "64 mib"': "line 3: spool.max_size is '64 mib'; write a size such as",
     'topics = ["/a"]\n[spool]\nmax_records = 1.5': "line 3: spool.max_records is 1.5; it should be a whole number",
     'topics = ["/a"]\n[spool]\nmax_records = 1': "line 3: spool.max_records is 1; it should be at least 16",

@@ -71,7 +71,7 @@ class OtherSettings:
 
 def test_kinds_are_found_by_name_and_may_be_added(monkeypatch):
     assert isinstance(open_source(SimSettings(), Selection(["**"])), SimSource)
-    with pytest.raises(SourceError, match="no source of kind 'other'; there are bag, sim"):
+    with pytest.raises(SourceError, match="no source of kind 'other'; there are bag, ros1, ros2, sim"):
         open_source(OtherSettings(), Selection(["**"]))
     monkeypatch.setitem(KINDS, "other", "a_module_of_nobody:Source")
     with pytest.raises(SourceError, match="needs a_module_of_nobody, which is not installed"):
