@@ -23,6 +23,7 @@ class SourceSettings(Protocol):
 
 KINDS: dict[str, str] = {
     "bag": "rosbridge_eth.sources.bag:BagSource",
+    "ros1": "rosbridge_eth.sources.ros1:Ros1Source",
     "ros2": "rosbridge_eth.sources.ros2:Ros2Source",
     "sim": "rosbridge_eth.sources.sim:SimSource",
 }

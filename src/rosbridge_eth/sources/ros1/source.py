@@ -1,0 +1,115 @@
+"""A live ROS 1 graph as a source, with no ROS installed.
+
+Two threads: one has the sockets (`node`) and never waits for anybody; the
+caller's own takes messages from the waiting room and emits them. So `emit` may
+block for as long as it likes: what then finds no room is dropped, oldest first,
+and counted. Publishers are never held up.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rosbridge_eth.capture import Decoder
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.ros1.addressing import master_endpoint, node_name
+from rosbridge_eth.sources.ros1.counters import TopicCounters
+from rosbridge_eth.sources.ros1.node import Node, NodeLimits, ask_offers
+from rosbridge_eth.sources.ros1.waiting import WaitingRoom
+from rosbridge_eth.sources.selection import Selection
+
+TAKE_PATIENCE = 0.1
+"""Seconds after which the emitting thread looks whether it is to stop."""
+STOP_PATIENCE = 1.0
+
+
+@dataclass(frozen=True)
+class Ros1Settings:
+    """Which master, and what it may cost.
+
+    master: URI; None is ROS_MASTER_URI. hostname: under which the master reaches us; None is ROS_HOSTNAME, ROS_IP or
+    the address towards the master. node: our name; None is one of its own for each process.
+    max_message: bytes. waiting: messages. timeout: seconds for a call, and for a publisher's header.
+    """
+
+    kind: ClassVar[str] = "ros1"
+    master: str | None = None
+    hostname: str | None = None
+    node: str | None = None
+    max_message: int = 32 << 20
+    waiting: int = 4096
+    timeout: float = 5.0
+
+
+class Ros1Source:
+    """The chosen topics of a master. It waits for a master that is not there yet; nothing is asked before `run`."""
+
+    live = True
+
+    def __init__(self, settings: Ros1Settings, selection: Selection, clock: Clock | None = None) -> None:
+        """Raises SourceError for a master's address that is none."""
+        self._settings, self._selection = settings, selection
+        self._clock = clock or SystemClock()
+        self._master = master_endpoint(settings.master)
+        self._name = node_name(settings.node)
+        self._closed = threading.Event()
+        self._counters: dict[str, TopicCounters] = {}
+        self._room = WaitingRoom(settings.waiting, 2 * settings.max_message)
+
+    def offers(self) -> Sequence[Offer]:
+        """What is published now, asked of the master. Raises SourceError."""
+        return ask_offers(self._master, self._name, self._settings.timeout)
+
+    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
+        """None: types are known when publishers are connected."""
+        return {}
+
+    def statistics(self) -> Mapping[str, TopicCounters]:
+        """By topic, as of now; from any thread."""
+        return {topic: counters.copy() for topic, counters in list(self._counters.items())}
+
+    @property
+    def waiting(self) -> int:
+        """Messages received and not emitted yet."""
+        return len(self._room)
+
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Emit until `stop` is set or the source closed; it ends within a second then, if `emit` returns.
+
+        Raises SourceError.
+        """
+        settings = self._settings
+        limits = NodeLimits(settings.max_message, 2 * settings.max_message, settings.timeout)
+        self._room = room = WaitingRoom(settings.waiting, 2 * settings.max_message)
+        node = Node(
+            self._master, settings.hostname, self._name, self._selection, limits, room, self._counters, self._clock
+        )
+        leave = threading.Event()
+        failure: list[BaseException] = []
+
+        def read() -> None:
+            try:
+                node.run(leave)
+            except BaseException as error:  # carried over to the caller's thread, which raises it
+                failure.append(error)
+
+        network = threading.Thread(target=read, name="ros1", daemon=True)
+        network.start()
+        try:
+            while not stop.is_set() and not self._closed.is_set() and network.is_alive():
+                message = room.take(TAKE_PATIENCE)
+                if message is not None:
+                    emit(message)
+        finally:
+            leave.set()
+            node.loop.wake()
+            network.join(STOP_PATIENCE)
+        if failure:
+            raise failure[0]
+
+    def close(self) -> None:
+        """Let `run` end, if it is running."""
+        self._closed.set()
