@@ -442,6 +442,9 @@ class Submitter:
         for job in sorted((job for job in mine if job.state is State.SEALED), key=_order):
             if job.nonce is None and (room <= 0 or job.held_nonce is not None):
                 continue
+            if job.kind is Kind.TOP_UP and job.nonce is None and self._needless(job):
+                self._drop_top_up(job, "the account has enough again", now)
+                continue
             if job.robot in tried and (job.robot in self._blocked or account in self._poor):
                 continue  # one is enough to find out whether it is so still
             tried.add(job.robot)
@@ -493,6 +496,11 @@ class Submitter:
         if amount > 0:
             self._keep(self._journal.top_up(batch.robot, account, amount, self._leases[self._operator.address], now))
             self._poor.discard(account)
+
+    def _needless(self, job: Job) -> bool:
+        """Did somebody else pay before this top-up was signed?"""
+        view = self._views.get(job.target or "")
+        return view is not None and view.balance >= self._settings.low_water and job.target not in self._poor
 
     def _urge(self, job: Job, view: AccountView, head: Block, now: float) -> list[Action]:
         """The lowest nonce that waits holds up all others."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from eth_abi.abi import decode, encode
 
 from bridge.ledger.world import ACCOUNT, OPERATOR, OTHER_ACCOUNT, OTHER_ROBOT, ROBOT, Ledger, Records
 from rosbridge_eth.errors import ChainError, VerificationError
@@ -211,6 +212,29 @@ def test_an_altered_record_is_noticed(made: Ledger, records: Records, node: Node
     node.tamper = alter
     found = fetch(node, at(node, made), ROBOT)
     assert set(kinds(found)) & {ProblemKind.ROOT_MISMATCH, ProblemKind.MALFORMED_EVENT}
+    assert {item.batch_index for item in found.records} == {0, 1, 3}
+
+
+def test_an_event_that_is_forged_to_be_consistent_is_not_what_the_contract_has(
+    made: Ledger, records: Records, node: Node
+):
+    write_some(made, records)
+    forged = records.run(5)
+    root = merkle.root([merkle.leaf_hash(record) for record in forged])
+
+    def forge(logs):
+        changed = []
+        for log in logs:
+            if log.topics[0] == topic("Batch") and log.topics[2] == (2).to_bytes(32, "big"):
+                types = ["bytes32", "uint64", "uint64", "bytes"]
+                _, number, previous, _ = decode(types, log.data)
+                log = replace(log, data=encode(types, [root, number, previous, packing.pack(forged)]))
+            changed.append(log)
+        return changed
+
+    node.tamper = forge
+    found = fetch(node, at(node, made), ROBOT)
+    assert kinds(found) == [ProblemKind.ROOT_MISMATCH]
     assert {item.batch_index for item in found.records} == {0, 1, 3}
 
 

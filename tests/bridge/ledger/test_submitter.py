@@ -504,6 +504,42 @@ def test_a_nonce_that_something_else_used_is_given_up_for_another():
     assert "another transaction" in job.reason
 
 
+def test_a_nonce_counts_as_lost_only_when_that_is_final():
+    world = World()
+    world.seal(world.records.run(3))
+    pump(world.submitter, world.chain, world.now)
+    (mine,) = world.model.pool.values()
+    world.model.pool.clear()
+    world.model.mine()
+    world.model.state.nonces[ACCOUNT.address] = 1  # somebody else's transaction, in the last block
+    for _ in range(2):
+        world.now += 2.0
+        pump(world.submitter, world.chain, world.now)
+        assert [(job.state, job.nonce) for job in world.jobs()] == [(State.PENDING, 0)]
+        world.model.mine()
+    world.model.reorg(3)  # and it is gone again
+    world.finish()
+    world.check()
+    assert world.model.receipts([mine.hash]) != [None]
+
+
+def test_a_revert_counts_only_when_it_is_final():
+    world = World()
+    world.seal(world.records.run(3))
+    pump(world.submitter, world.chain, world.now)
+    world.model.state.revoked.add(ROBOT)
+    world.model.mine()
+    world.now += 2.0
+    pump(world.submitter, world.chain, world.now)
+    assert [job.state for job in world.jobs()] == [State.PENDING]
+    world.model.blocks[0].state.revoked.clear()
+    world.model.reorg(1)
+    world.finish()
+    world.check()
+    (job,) = world.jobs()
+    assert (job.failures, job.nonce) == (0, 0)
+
+
 def test_a_gap_of_nonces_is_filled():
     world = World()
     world.seal(world.records.run(4))
@@ -681,6 +717,9 @@ def test_a_batch_that_is_mined_after_all_counts_once():
         world.step()
         originals += world.model.pool.values()
     last = originals[-1]
+    world.step()
+    world.step()  # the first half is sent in its place, the second must wait for what becomes of it
+    assert len(world.model.pool) == 1
     world.model.never_mines = lambda tx: False
     world.model.pool[last.sender, last.nonce] = last  # the network had kept the whole batch
     world.model.mine()
@@ -689,6 +728,20 @@ def test_a_batch_that_is_mined_after_all_counts_once():
     whole, *halves = world.jobs()
     assert whole.state is State.CONFIRMED
     assert {half.state for half in halves} == {State.VOID}
+
+
+def test_what_cannot_be_paid_for_is_not_taken_for_what_can_never_be_mined():
+    quick = Settings(limits=Limits(records=8), bump_after=4.0, stuck_blocks=2, stuck_bumps=1)
+    world = World(settings=quick, treasury=0)
+    world.seal(world.records.run(8))
+    pump(world.submitter, world.chain, world.now)
+    world.model.state.balances[ACCOUNT.address] = 1  # spent by another program in the meantime
+    for _ in range(40):
+        world.step()
+    assert [job.count for job in world.jobs()] == [8]
+    world.model.state.balances[ACCOUNT.address] = ETH
+    world.finish()
+    world.check()
 
 
 # ---------------------------------------------------------------------- one submitter at a time
