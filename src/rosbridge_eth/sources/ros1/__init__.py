@@ -7,7 +7,6 @@
     publication    a publisher's header: its type and decoder; md5 checks one against the other
     subscriptions  what to ask and whom to be connected to: a machine without sockets
     loop, node     the sockets
-    waiting        between the sockets and the caller
     source         the Source
 
 ROS 1 has no authentication: whoever reaches the network can publish. What is

@@ -35,5 +35,6 @@ class TopicCounters:
     connections: int = 0
     ended: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(Cause, 0))
 
-    def copy(self) -> TopicCounters:
-        return replace(self, ended=dict(self.ended))
+    def copy(self, *, dropped: int) -> TopicCounters:
+        """As of now, with what only the backlog knows."""
+        return replace(self, dropped=dropped, ended=dict(self.ended))

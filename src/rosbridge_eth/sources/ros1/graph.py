@@ -13,6 +13,8 @@ from rosbridge_eth.sources.ros1.errors import ProtocolError, Refusal
 from rosbridge_eth.sources.ros1.xmlrpc import Value
 
 SUCCESS = 1
+SHARED = frozenset({"/rosout"})
+"""Topics that every node publishes: naming a node does not mean them."""
 UNKNOWN_TYPE = "*"
 """A topic's type before anybody said it."""
 
@@ -60,7 +62,7 @@ def topic_types(value: Value) -> dict[str, str]:
 def offers(publishers: dict[str, list[str]], types: dict[str, str]) -> tuple[Offer, ...]:
     """What is published now, sorted by topic. A name that cannot be a topic's is left out."""
     return tuple(
-        Offer(topic, types.get(topic, UNKNOWN_TYPE), tuple(sorted(set(nodes))))
+        Offer(topic, types.get(topic, UNKNOWN_TYPE), () if topic in SHARED else tuple(sorted(set(nodes))))
         for topic, nodes in sorted(publishers.items())
         if is_graph_name(topic)
     )

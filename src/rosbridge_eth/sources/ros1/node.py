@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from rosbridge_eth.capture import RawMessage
 from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Offer
 from rosbridge_eth.sources.ros1.addressing import Endpoint, bind_host, own_host, read_uri, uri_of
 from rosbridge_eth.sources.ros1.counters import Cause, TopicCounters
@@ -26,7 +27,6 @@ from rosbridge_eth.sources.ros1.http import BodyReader, encode_request, encode_r
 from rosbridge_eth.sources.ros1.loop import CLOSED, Connection, Ended, Loop, Received
 from rosbridge_eth.sources.ros1.publication import Publication, read_publication, request_header
 from rosbridge_eth.sources.ros1.subscriptions import Connect, Disconnect, MasterCall, Say, Subscriptions
-from rosbridge_eth.sources.ros1.waiting import WaitingRoom
 from rosbridge_eth.sources.ros1.xmlrpc import (
     Value,
     decode_answer,
@@ -208,13 +208,13 @@ class Node:
 
     def __init__(
         self, master: Endpoint, host: str | None, name: str, selection: Selection, limits: NodeLimits,
-        room: WaitingRoom, counters: dict[str, TopicCounters], clock: Clock,
+        backlog: Backlog, counters: dict[str, TopicCounters], clock: Clock,
     ) -> None:  # fmt: skip
         self.limits = limits
         self.partial = 0
         self.loop = Loop()
         self._master, self._host, self._name, self._selection = master, host, name, selection
-        self._room, self._counters, self._clock = room, counters, clock
+        self._backlog, self._counters, self._clock = backlog, counters, clock
         self._publishers: dict[tuple[str, str], _Publisher] = {}
         self._said: dict[str, None] = {}
         self._timer = 0.0
@@ -386,15 +386,9 @@ class Node:
         counters.bytes += len(body)
         if publication.latching and publisher.messages == 1:
             counters.latched += 1
-        message = RawMessage(
-            publisher.topic, publication.type_name, self._clock.wall_ns(), body, publication.decoder
+        self._backlog.put(
+            RawMessage(publisher.topic, publication.type_name, self._clock.wall_ns(), body, publication.decoder)
         )
-        for dropped in self._room.put(message):
-            self._counters_of(dropped.topic).dropped += 1
-            self._say(
-                f"dropped {dropped.topic}",
-                f"{dropped.topic}: messages come faster than they are taken; the oldest are dropped and counted",
-            )
 
     def passed_over(self, publisher: _Publisher, length: int) -> None:
         """A message is not read."""

@@ -1,7 +1,7 @@
 """A live ROS 1 graph as a source, with no ROS installed.
 
 Two threads: one has the sockets (`node`) and never waits for anybody; the
-caller's own takes messages from the waiting room and emits them. So `emit` may
+caller's own takes messages from the backlog and emits them. So `emit` may
 block for as long as it likes: what then finds no room is dropped, oldest first,
 and counted. Publishers are never held up.
 """
@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from rosbridge_eth.capture import Decoder
+from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
 from rosbridge_eth.sources.ros1.addressing import master_endpoint, node_name
 from rosbridge_eth.sources.ros1.counters import TopicCounters
 from rosbridge_eth.sources.ros1.node import Node, NodeLimits, ask_offers
-from rosbridge_eth.sources.ros1.waiting import WaitingRoom
 from rosbridge_eth.sources.selection import Selection
 
 TAKE_PATIENCE = 0.1
@@ -57,7 +57,7 @@ class Ros1Source:
         self._name = node_name(settings.node)
         self._closed = threading.Event()
         self._counters: dict[str, TopicCounters] = {}
-        self._room = WaitingRoom(settings.waiting, 2 * settings.max_message)
+        self._backlog = Backlog(settings.waiting, 2 * settings.max_message)
 
     def offers(self) -> Sequence[Offer]:
         """What is published now, asked of the master. Raises SourceError."""
@@ -69,12 +69,15 @@ class Ros1Source:
 
     def statistics(self) -> Mapping[str, TopicCounters]:
         """By topic, as of now; from any thread."""
-        return {topic: counters.copy() for topic, counters in list(self._counters.items())}
+        dropped = self._backlog.dropped
+        return {
+            topic: counters.copy(dropped=dropped.get(topic, 0)) for topic, counters in list(self._counters.items())
+        }
 
     @property
-    def waiting(self) -> int:
-        """Messages received and not emitted yet."""
-        return len(self._room)
+    def dropped(self) -> Mapping[str, int]:
+        """Messages received and lost here for want of time, by topic."""
+        return self._backlog.dropped
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit until `stop` is set or the source closed; it ends within a second then, if `emit` returns.
@@ -83,9 +86,8 @@ class Ros1Source:
         """
         settings = self._settings
         limits = NodeLimits(settings.max_message, 2 * settings.max_message, settings.timeout)
-        self._room = room = WaitingRoom(settings.waiting, 2 * settings.max_message)
         node = Node(
-            self._master, settings.hostname, self._name, self._selection, limits, room, self._counters, self._clock
+            self._master, settings.hostname, self._name, self._selection, limits, self._backlog, self._counters, self._clock
         )
         leave = threading.Event()
         failure: list[BaseException] = []
@@ -100,7 +102,7 @@ class Ros1Source:
         network.start()
         try:
             while not stop.is_set() and not self._closed.is_set() and network.is_alive():
-                message = room.take(TAKE_PATIENCE)
+                message = self._backlog.take(TAKE_PATIENCE)
                 if message is not None:
                     emit(message)
         finally:
