@@ -187,6 +187,47 @@ class BagConfig(Section):
         return BagSettings(self.path, self.speed, self.start or 0, self.stop)
 
 
+class Ros1Config(Section):
+    """A live ROS 1 master, with no ROS installed here (docs/howto-ros1.md)."""
+
+    kind: Literal["ros1"] = Field(description="`ros1`")
+    master: Annotated[str, AfterValidator(_master)] | None = Field(
+        default=None,
+        description="The master's URI; without it, that of `ROS_MASTER_URI`, otherwise `http://localhost:11311`.",
+    )
+    hostname: Annotated[str, AfterValidator(_host)] | None = Field(
+        default=None,
+        description="Name or address under which the master reaches this machine; without it, `ROS_HOSTNAME`, "
+        "`ROS_IP`, or the address that this machine uses towards the master.",
+    )
+    node: Annotated[str, AfterValidator(_node)] | None = Field(
+        default=None,
+        description="The name under which the robot appears in the graph; without it, one of its own for each "
+        "process, `/rosbridge_eth_MACHINE_PID`.",
+    )
+    max_message: Size = Field(
+        default=32 * MIB,
+        ge=KIB,
+        le=64 * MIB,
+        description="A larger message is not read, but counted. Messages that wait or are arriving take at most "
+        "four times as much memory.",
+    )
+    waiting: int = Field(
+        default=4096,
+        ge=16,
+        le=1_000_000,
+        description="Messages that wait to be captured, at most; the topic that has most of them then loses its "
+        "oldest, which is counted. Publishers are never made to wait.",
+    )
+    timeout: Seconds = Field(
+        default=5.0, ge=0.1, le=60, description="For a call to the master or a publisher, and for a publisher's header."
+    )
+
+    def settings(self) -> Ros1Settings:
+        """For sources.open_source."""
+        return Ros1Settings(self.master, self.hostname, self.node, self.max_message, self.waiting, self.timeout)
+
+
 class Ros2Config(Section):
     """The live ROS 2 graph, through the rclpy of the Python that runs the robot."""
 
@@ -221,8 +262,9 @@ class SimConfig(Section):
         return SimSettings(self.robot, self.seed, self.rate, self.duration, self.speed)
 
 
-SOURCE_KINDS: dict[str, type[BagConfig | Ros2Config | SimConfig]] = {
+SOURCE_KINDS: dict[str, type[BagConfig | Ros1Config | Ros2Config | SimConfig]] = {
     "bag": BagConfig,
+    "ros1": Ros1Config,
     "ros2": Ros2Config,
     "sim": SimConfig,
 }
@@ -242,7 +284,7 @@ def _known_kind(value: Any) -> Any:
     return value
 
 
-AnySource: TypeAlias = BagConfig | Ros2Config | SimConfig
+AnySource: TypeAlias = BagConfig | Ros1Config | Ros2Config | SimConfig
 SourceConfig: TypeAlias = Annotated[AnySource, Discriminator("kind")]
 _ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
 

@@ -87,8 +87,9 @@ class Ros1Source:
         settings = self._settings
         limits = NodeLimits(settings.max_message, 2 * settings.max_message, settings.timeout)
         node = Node(
-            self._master, settings.hostname, self._name, self._selection, limits, self._backlog, self._counters, self._clock
-        )
+            self._master, settings.hostname, self._name, self._selection, limits,
+            self._backlog, self._counters, self._clock,
+        )  # fmt: skip
         leave = threading.Event()
         failure: list[BaseException] = []
 
