@@ -718,6 +718,7 @@ class Submitter:
 
     def _drop_top_up(self, job: Job, reason: str, now: float) -> None:
         """It is planned anew if it is needed still."""
+        self._treasury_empty = False
         lease = self._leases[self._account_for(job) or ""]
         self._keep(*filter(None, self._journal.refused(job, lease, reason, now)))
 

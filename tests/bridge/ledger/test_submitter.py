@@ -739,9 +739,11 @@ def test_what_cannot_be_paid_for_is_not_taken_for_what_can_never_be_mined():
     for _ in range(40):
         world.step()
     assert [job.count for job in world.jobs()] == [8]
-    world.model.state.balances[ACCOUNT.address] = ETH
+    assert world.submitter.status().treasury_empty
+    world.model.state.balances[ACCOUNT.address] = ETH  # somebody pays; the top-up that was planned is not needed
     world.finish()
     world.check()
+    assert not world.submitter.status().treasury_empty
 
 
 # ---------------------------------------------------------------------- one submitter at a time
