@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent / "results.json"
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
     if getattr(config.option, "benchmark_json", "absent") is None:
-        config.option.benchmark_json = RESULTS.open("wb")
+        config.option.benchmark_json = RESULTS
 
 
 def pytest_benchmark_update_machine_info(config: pytest.Config, machine_info: dict[str, object]) -> None:
