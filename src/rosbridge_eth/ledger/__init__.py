@@ -1,6 +1,6 @@
 """The ledger: the contract, the chains it runs on, and how batches get there and come back.
 
-    chain = ledger.connect("http://127.0.0.1:8545")      or ledger.embedded()
+    chain = ledger.connect("http://127.0.0.1:8545")      or ledger.embedded.EmbeddedChain()
     contract = ledger.deploy(chain, operator)            or ledger.Contract.at(chain, address)
     journal = ledger.Journal(path, ledger.Binding.of(contract))
     submitter = ledger.Submitter(journal, ...)           submitter.seal(records, now)
@@ -13,7 +13,6 @@ commands which talk to no node start fast.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rosbridge_eth.ledger.accounts import Keyring
@@ -28,7 +27,6 @@ from rosbridge_eth.ledger.recovery import adopt_history, missing_batches
 from rosbridge_eth.ledger.submitter import BatchTiming, Sealing, Settings, Status, Submitter
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger.embedded import EmbeddedChain
     from rosbridge_eth.ledger.jsonrpc import JsonRpcChain
 
 __all__ = [
@@ -60,7 +58,6 @@ __all__ = [
     "block_at",
     "connect",
     "deploy",
-    "embedded",
     "fetch",
     "missing_batches",
     "pump",
@@ -77,10 +74,3 @@ def connect(url: str, *, timeout: float = 10.0, attempts: int = 1) -> JsonRpcCha
     from rosbridge_eth.ledger.jsonrpc import JsonRpcChain
 
     return JsonRpcChain(url, timeout=timeout, attempts=attempts)
-
-
-def embedded(*, fund: Mapping[str, int] | None = None, auto_mine: bool = True) -> EmbeddedChain:
-    """A chain in this process that ends with it; `fund` gives addresses their first wei."""
-    from rosbridge_eth.ledger.embedded import EmbeddedChain
-
-    return EmbeddedChain(fund=fund, auto_mine=auto_mine)
