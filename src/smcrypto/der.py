@@ -159,6 +159,7 @@ class Reader:
         return self._data[self._pos] if self._pos < self._end else None
 
     def at_end(self) -> bool:
+        """Is nothing left?"""
         return self._pos >= self._end
 
     def finish(self) -> None:
@@ -191,6 +192,7 @@ class Reader:
         return self._data[begin : self._pos]
 
     def boolean(self) -> bool:
+        """A BOOLEAN: 00 or FF, nothing else (11.1)."""
         start, end = self._content(BOOLEAN)
         if end - start != 1 or self._data[start] not in (0x00, 0xFF):
             raise InvalidEncoding(f"boolean at byte {start} is neither 00 nor FF")
@@ -202,6 +204,7 @@ class Reader:
         return self._number(start, end, signed)
 
     def enumerated(self) -> int:
+        """An ENUMERATED, not negative, in the fewest bytes (8.4)."""
         start, end = self._content(ENUMERATED)
         return self._number(start, end, False)
 
@@ -224,6 +227,7 @@ class Reader:
         return int.from_bytes(data[start:end], "big", signed=True)
 
     def octet_string(self) -> bytes:
+        """An OCTET STRING in one piece (10.2)."""
         start, end = self._content(OCTET_STRING)
         return self._data[start:end]
 
@@ -239,6 +243,7 @@ class Reader:
         return _bits(self.value(BIT_STRING))
 
     def null(self) -> None:
+        """A NULL, which is empty (8.8)."""
         start, end = self._content(NULL)
         if start != end:
             raise InvalidEncoding(f"null at byte {start} is not empty")
@@ -249,6 +254,7 @@ class Reader:
         return _dotted(self._data[start:end])
 
     def sequence(self) -> Reader:
+        """A reader of what is inside a SEQUENCE."""
         return self._inner(SEQUENCE)
 
     def set_of(self) -> Reader:
@@ -258,6 +264,7 @@ class Reader:
         return inner
 
     def implicit_set_of(self, number: int) -> Reader:
+        """As `set_of`, under the implicit tag [number]."""
         inner = self._inner(_CONTEXT | _CONSTRUCTED | number)
         inner._require_order()
         return inner
@@ -271,9 +278,11 @@ class Reader:
         return self.value(_CONTEXT | number)
 
     def has_explicit(self, number: int) -> bool:
+        """Does the constructed tag [number] come next?"""
         return self.peek_tag() == _CONTEXT | _CONSTRUCTED | number
 
     def has_implicit(self, number: int) -> bool:
+        """Does the primitive tag [number] come next?"""
         return self.peek_tag() == _CONTEXT | number
 
     def time(self) -> datetime:
@@ -398,6 +407,7 @@ def element(tag: int, content: bytes) -> bytes:
 
 
 def boolean(value: bool) -> bytes:
+    """A BOOLEAN: FF for true (11.1)."""
     return b"\x01\x01\xff" if value else b"\x01\x01\x00"
 
 
@@ -408,14 +418,17 @@ def _magnitude(number: int) -> bytes:
 
 
 def integer(number: int) -> bytes:
+    """An INTEGER, in the fewest bytes (8.3)."""
     return element(INTEGER, _magnitude(number))
 
 
 def enumerated(number: int) -> bytes:
+    """An ENUMERATED, in the fewest bytes (8.4)."""
     return element(ENUMERATED, _magnitude(number))
 
 
 def octet_string(content: bytes) -> bytes:
+    """An OCTET STRING."""
     return element(OCTET_STRING, content)
 
 
@@ -436,6 +449,7 @@ def named_bits(bits: Iterable[int]) -> bytes:
 
 
 def null() -> bytes:
+    """A NULL."""
     return b"\x05\x00"
 
 
@@ -462,6 +476,7 @@ def oid(dotted: str) -> bytes:
 
 
 def sequence(*parts: bytes) -> bytes:
+    """A SEQUENCE of encoded parts, in their order."""
     return element(SEQUENCE, b"".join(parts))
 
 
@@ -481,6 +496,7 @@ def implicit(number: int, content: bytes) -> bytes:
 
 
 def utf8_string(text: str) -> bytes:
+    """A UTF8String."""
     return element(UTF8_STRING, text.encode("utf-8"))
 
 

@@ -118,14 +118,17 @@ class Certificate:
 
     @property
     def serial_number(self) -> int:
+        """The number that its issuer gave it; with the issuer's name it tells the certificate from all others."""
         return self._serial_number
 
     @property
     def issuer(self) -> Name:
+        """The name of who signed it."""
         return self._issuer
 
     @property
     def subject(self) -> Name:
+        """The name of whose key it holds."""
         return self._subject
 
     @property
@@ -140,6 +143,7 @@ class Certificate:
 
     @property
     def public_key(self) -> sm2.PublicKey:
+        """The subject's SM2 key."""
         return self._public_key
 
     @property
@@ -149,6 +153,7 @@ class Certificate:
 
     @property
     def basic_constraints(self) -> ext.BasicConstraints | None:
+        """Whether it is a CA's, and how many CAs may follow (RFC 5280, 4.2.1.9); None without the extension."""
         return self._basic_constraints
 
     @property
@@ -173,10 +178,12 @@ class Certificate:
 
     @property
     def subject_key_identifier(self) -> bytes | None:
+        """The name of its key (4.2.1.2), by which those it issues point to it; None without the extension."""
         return self._subject_key_identifier
 
     @property
     def authority_key_identifier(self) -> ext.AuthorityKeyIdentifier | None:
+        """Which key of the issuer signed it (4.2.1.1); None without the extension."""
         return self._authority_key_identifier
 
     @property
@@ -204,9 +211,11 @@ class Certificate:
         return sm3.digest(self._der)
 
     def to_der(self) -> bytes:
+        """The bytes it was read from, or issued as."""
         return self._der
 
     def to_pem(self) -> bytes:
+        """The same as PEM, label CERTIFICATE."""
         return pem.encode(LABEL, self._der)
 
     def __eq__(self, other: object) -> bool:

@@ -74,6 +74,7 @@ class Extension:
     value: bytes
 
     def to_der(self) -> bytes:
+        """Extension ::= SEQUENCE { extnID, critical, extnValue } (RFC 5280, 4.1)."""
         # DER leaves out a critical that is FALSE, its default (X.690, 11.5).
         flag = der.boolean(True) if self.critical else b""
         return der.sequence(der.oid(self.oid), flag, der.octet_string(self.value))

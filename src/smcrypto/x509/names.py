@@ -141,6 +141,7 @@ class Name:
 
     @property
     def rdns(self) -> tuple[tuple[Attribute, ...], ...]:
+        """The relative distinguished names, from the root downwards, each of one attribute or more."""
         return self._rdns
 
     @property
@@ -154,6 +155,7 @@ class Name:
         return next((a.text for a in reversed(self.attributes) if a.oid == oid), None)
 
     def to_der(self) -> bytes:
+        """The bytes it was read from, or the name written (X.501, 9.2)."""
         return self._der
 
     def rfc4514(self) -> str:

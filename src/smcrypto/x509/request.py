@@ -66,6 +66,7 @@ class CertificateSigningRequest:
 
     @classmethod
     def from_pem(cls, data: BytesLike) -> CertificateSigningRequest:
+        """The first request in `data`; text and other blocks around it are skipped."""
         return cls.from_der(one_block(as_bytes(data, "data"), _LABELS, "certificate signing request"))
 
     @classmethod
@@ -97,14 +98,17 @@ class CertificateSigningRequest:
 
     @property
     def subject(self) -> Name:
+        """The name that is asked for."""
         return self._subject
 
     @property
     def public_key(self) -> sm2.PublicKey:
+        """The SM2 key to be certified."""
         return self._public_key
 
     @property
     def attributes(self) -> tuple[RequestAttribute, ...]:
+        """All attributes, in their order (RFC 2986, 4.1)."""
         return self._attributes
 
     @property
@@ -117,16 +121,19 @@ class CertificateSigningRequest:
 
     @property
     def subject_alt_names(self) -> tuple[str, ...]:
+        """The alternative names asked for, as in `Certificate.subject_alt_names`."""
         value = self._value(ext.SUBJECT_ALT_NAME)
         return () if value is None else ext.read_subject_alt_names(value)
 
     @property
     def key_usage(self) -> frozenset[str] | None:
+        """The usages asked for, by name; None if nothing is said."""
         value = self._value(ext.KEY_USAGE)
         return None if value is None else ext.read_key_usage(value)
 
     @property
     def extended_key_usage(self) -> tuple[str, ...] | None:
+        """The purposes asked for, by name or dotted identifier; None if nothing is said."""
         value = self._value(ext.EXTENDED_KEY_USAGE)
         return None if value is None else ext.read_extended_key_usage(value)
 
@@ -141,9 +148,11 @@ class CertificateSigningRequest:
         self._verified = True
 
     def to_der(self) -> bytes:
+        """The bytes it was read from, or made as."""
         return self._der
 
     def to_pem(self) -> bytes:
+        """The same as PEM, label CERTIFICATE REQUEST."""
         return pem.encode(_LABELS[0], self._der)
 
     def __eq__(self, other: object) -> bool:

@@ -124,6 +124,7 @@ class CertificateRevocationList:
 
     @classmethod
     def from_pem(cls, data: BytesLike) -> CertificateRevocationList:
+        """The first revocation list in `data`; text and other blocks around it are skipped."""
         return cls.from_der(one_block(as_bytes(data, "data"), _LABELS, "revocation list"))
 
     @classmethod
@@ -194,10 +195,12 @@ class CertificateRevocationList:
 
     @property
     def issuer(self) -> Name:
+        """The name of the CA whose certificates it is about."""
         return self._issuer
 
     @property
     def this_update(self) -> datetime:
+        """When it was made, aware, UTC."""
         return self._this_update
 
     @property
@@ -207,14 +210,17 @@ class CertificateRevocationList:
 
     @property
     def number(self) -> int | None:
+        """Its place among the lists of its issuer (RFC 5280, 5.2.3); None if it does not say."""
         return self._number
 
     @property
     def revoked(self) -> tuple[RevokedCertificate, ...]:
+        """Every entry, in the order of the list."""
         return tuple(self._by_serial.values())
 
     @property
     def extensions(self) -> tuple[ext.Extension, ...]:
+        """All extensions of the list, in their order."""
         return self._extensions
 
     def find(self, serial_number: int) -> RevokedCertificate | None:
@@ -243,9 +249,11 @@ class CertificateRevocationList:
             raise CertificateError(f"the revocation list of {self._issuer} is stale: the next was due {due}")
 
     def to_der(self) -> bytes:
+        """The bytes it was read from, or made as."""
         return self._der
 
     def to_pem(self) -> bytes:
+        """The same as PEM, label X509 CRL."""
         return pem.encode(_LABELS[0], self._der)
 
     def __eq__(self, other: object) -> bool:
