@@ -271,7 +271,8 @@ class Trust:
                     crls=self.crls,
                 )
             except CertificateError as error:
-                kind = RevokedCertificate if "revoked" in str(error) else UntrustedCertificate
+                revoked = isinstance(error, x509.CertificateRevokedError)
+                kind = RevokedCertificate if revoked else UntrustedCertificate
                 raise kind(f"the certificate of {peer} is not to be trusted: {error}") from error
         if not _apart(signing.key_usage, encryption.key_usage):
             raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
