@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ast
 import doctest
-import importlib
+import importlib.util
 import inspect
 import os
 import pkgutil
@@ -24,9 +24,9 @@ from types import ModuleType
 from typing import NamedTuple
 
 import pytest
-from conftest import unavailable
 
 import smcrypto
+from conftest import unavailable
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
