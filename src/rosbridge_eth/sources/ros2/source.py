@@ -410,7 +410,7 @@ class Ros2Source:
 
     def _tell_unmatched(self) -> None:
         offers = self._read_graph()[0]
-        missing = self._selection.unmatched(offers)
+        missing = self._selection.unmatched([*offers, *(topic.offer for topic in self._topics.values())])
         if missing:
             there = ", ".join(map(str, offers[:20])) or "no topics"
             log.warning(

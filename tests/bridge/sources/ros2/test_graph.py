@@ -1,0 +1,312 @@
+"""The ros2 source against genuine nodes: types, qualities of service, nodes that come, go and die."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections import Counter
+
+import pytest
+from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from bridge.sources.ros2.graph import Graph
+from rosbridge_eth.capture import Capture, TopicRule
+from rosbridge_eth.capture.conversion import to_json
+from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from smcrypto import sm3
+
+pytestmark = pytest.mark.service
+STRING, NUMBER, ODOMETRY = "std_msgs/msg/String", "std_msgs/msg/UInt32", "nav_msgs/msg/Odometry"
+
+
+def data_of(records, topic):
+    return [record["data"] for record in records if record["topic"] == topic]
+
+
+MESSAGES = {
+    # topic: type, fields as published, record's data
+    "/said": (STRING, {"data": "零 é 😀"}, {"data": "零 é 😀"}),
+    "/joints": (
+        "sensor_msgs/msg/JointState",
+        {"header": {"stamp": {"sec": 5, "nanosec": 7}, "frame_id": "arm"}, "name": ["a"], "position": [1.5]},
+        {
+            "header": {"stamp": 5_000_000_007, "frame_id": "arm"},
+            "name": ["a"], "position": [1.5], "velocity": [], "effort": [],
+        },
+    ),
+    "/scan": (
+        "sensor_msgs/msg/LaserScan",
+        {"angle_min": -0.5, "ranges": [1.0, float("inf"), float("nan")]},
+        {
+            "header": {"stamp": 0, "frame_id": ""}, "angle_min": -0.5, "angle_max": 0.0, "angle_increment": 0.0,
+            "time_increment": 0.0, "scan_time": 0.0, "range_min": 0.0, "range_max": 0.0,
+            "ranges": [1.0, "Infinity", "NaN"], "intensities": [],
+        },
+    ),
+    "/image": (
+        "sensor_msgs/msg/CompressedImage",
+        {"format": "jpeg", "data": {"bytes": [255, 0, 1]}},
+        {"header": {"stamp": 0, "frame_id": ""}, "format": "jpeg", "data": "/wAB"},
+    ),
+    # From here on types of a package that nobody but the robot's own ROS knows.
+    "/own/strings": (
+        "test_msgs/msg/Strings",
+        {"string_value": "x", "bounded_string_value": "y"},
+        {
+            "string_value": "x", "string_value_default1": "Hello world!", "string_value_default2": "Hello'world!",
+            "string_value_default3": 'Hello"world!', "string_value_default4": "Hello'world!",
+            "string_value_default5": 'Hello"world!', "bounded_string_value": "y",
+            "bounded_string_value_default1": "Hello world!", "bounded_string_value_default2": "Hello'world!",
+            "bounded_string_value_default3": 'Hello"world!', "bounded_string_value_default4": "Hello'world!",
+            "bounded_string_value_default5": 'Hello"world!',
+        },
+    ),
+    "/own/nested": (
+        "test_msgs/msg/Nested",
+        {
+            "basic_types_value": {
+                "bool_value": True, "byte_value": {"bytes": [200]}, "char_value": 65, "int64_value": -(2**63),
+            }
+        },
+        {
+            "basic_types_value": {
+                "bool_value": True, "byte_value": 200, "char_value": 65, "float32_value": 0.0, "float64_value": 0.0,
+                "int8_value": 0, "uint8_value": 0, "int16_value": 0, "uint16_value": 0, "int32_value": 0,
+                "uint32_value": 0, "int64_value": -(2**63), "uint64_value": 0,
+            }
+        },
+    ),
+    "/own/empty": ("test_msgs/msg/Empty", {}, {}),
+    "/own/times": (
+        "test_msgs/msg/Builtins",
+        {"duration_value": {"sec": -2, "nanosec": 500_000_000}, "time_value": {"sec": 1, "nanosec": 2}},
+        {"duration_value": -1_500_000_000, "time_value": 1_000_000_002},
+    ),
+}  # fmt: skip
+
+
+def test_messages_of_any_type_become_records(ros: Graph):
+    known = get_typestore(Stores.ROS2_KILTED).fielddefs
+    assert not any(kind in known for topic, (kind, *_) in MESSAGES.items() if topic.startswith("/own/"))
+    node = ros.node("/robot_1/base")
+    for topic, (kind, fields, _) in MESSAGES.items():
+        node.order(create=topic, type=kind, latched=True)
+        node.order(publish=topic, fields=fields)
+    records = ros.watcher('topics = ["/**"]').recorded(len(MESSAGES))
+    assert {record["topic"]: record["type"] for record in records} == {
+        topic: kind for topic, (kind, *_) in MESSAGES.items()
+    }
+    assert {record["topic"]: record["data"] for record in records} == {
+        topic: data for topic, (*_, data) in MESSAGES.items()
+    }
+
+
+def test_the_same_odometry_gives_the_same_record_from_ros_1_and_ros_2(ros: Graph):
+    """The sample bag was recorded by ROS 1; its Odometry is published again by ROS 2."""
+    capture = Capture([TopicRule("/robot_1/odom")])
+    source = BagSource(BagSettings(sample_bag(), None), Selection(["/robot_1/odom"]))
+    from_ros1 = [capture.process(raw, 0, 0).data_json for raw in itertools.islice(source.messages(), 20)]
+    capture = Capture([TopicRule("/robot_1/odom")])
+    node = ros.node("/base")
+    node.order(create="/robot_1/odom", type=ODOMETRY, latched=True, depth=20)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Reader(sample_bag()) as bag:
+        chosen = [connection for connection in bag.connections if connection.topic == "/robot_1/odom"]
+        for connection, _, raw in itertools.islice(bag.messages(chosen), 20):
+            node.order(publish="/robot_1/odom", fields=as_ros2(store.deserialize_ros1(raw, connection.msgtype)))
+    records = ros.watcher('topics = ["/robot_1/odom"]').recorded(20)
+    assert [record["type"] for record in records] == [ODOMETRY] * 20
+    assert [to_json(record["data"]) for record in records] == from_ros1
+
+
+def as_ros2(message):
+    """The fields of a rosbags message, without the header's `seq`, which ROS 2 does not have."""
+    fields = {}
+    for name in message.__dataclass_fields__.keys() - {"seq", "__msgtype__"}:
+        value = getattr(message, name)
+        if hasattr(value, "__dataclass_fields__"):
+            value = as_ros2(value)
+        fields[name] = value.tolist() if hasattr(value, "tolist") else value
+    return fields
+
+
+@pytest.mark.parametrize("reliable", [True, False], ids=["reliable", "best effort"])
+@pytest.mark.parametrize("latched", [True, False], ids=["transient local", "volatile"])
+def test_whatever_quality_is_offered_is_matched(ros: Graph, reliable, latched):
+    node = ros.node("/base")
+    node.order(create="/t", type=STRING, reliable=reliable, latched=latched, depth=1)
+    node.order(publish="/t", fields={"data": "before"})
+    watcher = ros.watcher('topics = ["/t"]')
+    words = f"{'reliable' if reliable else 'best effort'}, {'transient local' if latched else 'volatile'}"
+    watcher.says(f"watched ({STRING}, {words})")
+    if latched and reliable:
+        assert data_of(watcher.recorded(1), "/t") == [{"data": "before"}]
+    node.order(**{"await": "/t"})
+    node.order(publish="/t", fields={"data": "after"})
+    watcher.until(lambda: {"data": "after"} in data_of(watcher.records, "/t"), "the message")
+    assert watcher.stop()["/t"]["lost"] == 0
+
+
+def test_publishers_of_one_topic_may_differ_and_change(ros: Graph):
+    """Nothing of the reliable one is lost or repeated while another comes that offers less, and goes."""
+    first, second = ros.node("/first"), ros.node("/second")
+    first.order(create="/t", type=STRING, latched=True, depth=1)
+    first.order(publish="/t", fields={"data": "latched"})
+    watcher = ros.watcher('topics = ["/t"]')
+    watcher.recorded(1)
+    second.order(create="/t", type=STRING, reliable=False)
+    first.order(burst="/t", count=100, rate=200)
+    second.order(**{"await": "/t"})
+    watcher.says("now watched as best effort, volatile")
+    second.order(publish="/t", fields={"data": "second"})
+    first.order(publish="/t", fields={"data": "both"})
+    watcher.recorded(103)
+    second.order(destroy="/t")
+    watcher.says("now watched as reliable, transient local")
+    first.order(publish="/t", fields={"data": "alone"})
+    watcher.recorded(104)
+    statistics = watcher.stop()
+    said = [data["data"] for data in data_of(watcher.records, "/t")]
+    assert [word for word in said if word != "second"] == ["latched", *map(str, range(100)), "both", "alone"]
+    assert statistics == {"/t": {"received": 104, "lost": 0, "dropped": 0, "foreign": 0}}
+
+
+def test_a_topic_may_appear_late_and_the_domain_may_be_configured(ros: Graph):
+    elsewhere = str(ros.domain % 90 + 1)
+    watcher = ros.watcher(
+        f'topics = ["/late/*", "/never"]\n[source]\nkind = "ros2"\ndomain = {ros.domain}', ROS_DOMAIN_ID=elsewhere
+    )
+    watcher.says("nothing publishes /late/*, /never yet")
+    node = ros.node("/base")
+    for topic in ("/late/a", "/late/b", "/other"):
+        node.order(create=topic, type=NUMBER)
+    for topic in ("/late/a", "/late/b"):
+        node.order(**{"await": topic})
+    node.order(burst=["/late/a", "/late/b", "/other"], count=50)
+    records = watcher.recorded(100)
+    for topic in ("/late/a", "/late/b"):
+        assert [data["data"] for data in data_of(records, topic)] == list(range(50))
+    assert set(watcher.stop()) == {"/late/a", "/late/b"}
+
+
+def test_a_publisher_that_is_killed_is_heard_again_from_its_first_message(ros: Graph):
+    watcher = ros.watcher('topics = ["/t"]')
+    for start in range(3):
+        node = ros.node("/base")
+        node.order(create="/t", type=NUMBER)
+        node.order(**{"await": "/t"})
+        node.order(burst="/t", count=20)
+        watcher.recorded(20 * (start + 1))
+        node.kill()
+    assert [data["data"] for data in data_of(watcher.records, "/t")] == [*range(20)] * 3
+    assert sum("watched" in line for line in watcher.errors) == 1
+
+
+def test_a_node_stands_for_what_it_publishes(ros: Graph):
+    arm, base = ros.node("/robot_1/arm"), ros.node("/robot_1/base")
+    arm.order(create="/joints", type=STRING, latched=True)
+    arm.order(create="/shared", type=STRING, latched=True)
+    base.order(create="/odom", type=STRING, latched=True)
+    base.order(create="/shared", type=STRING, latched=True)
+    arm.order(create="/_hidden", type=STRING, latched=True)
+    for node, topic in ((arm, "/joints"), (arm, "/shared"), (base, "/odom"), (base, "/shared"), (arm, "/_hidden")):
+        node.order(publish=topic, fields={"data": "x"})
+    watcher = ros.watcher('topics = []\nnodes = ["/robot_1/arm"]')
+    watcher.recorded(3)
+    arm.order(create="/joints/late", type=STRING)
+    arm.order(**{"await": "/joints/late"})
+    arm.order(publish="/joints/late", fields={"data": "x"})
+    watcher.recorded(4)
+    watcher.stop()
+    counts = Counter(record["topic"] for record in watcher.records)
+    assert counts == {"/joints": 1, "/shared": 2, "/joints/late": 1}
+
+
+def test_ten_topics_at_100_hz_lose_nothing(ros: Graph):
+    topics = [f"/odom_{number}" for number in range(10)]
+    node = ros.node("/base")
+    for topic in topics:
+        node.order(create=topic, type=ODOMETRY, depth=100)
+    watcher = ros.watcher('topics = ["/odom_*"]')
+    for topic in topics:
+        node.order(**{"await": topic})
+    node.order(burst=topics, count=300, rate=100)
+    watcher.recorded(3000)
+    statistics = watcher.stop()
+    assert statistics == {topic: {"received": 300, "lost": 0, "dropped": 0, "foreign": 0} for topic in topics}
+    for topic in topics:
+        stamps = [data["header"]["stamp"] for data in data_of(watcher.records, topic)]
+        assert stamps == [second * 10**9 for second in range(300)]
+
+
+def test_huge_messages_arrive_whole(ros: Graph):
+    node = ros.node("/camera")
+    node.order(create="/compressed", type="sensor_msgs/msg/CompressedImage")
+    watcher = ros.watcher('topics = ["/compressed"]')
+    node.order(**{"await": "/compressed"})
+    size = 8 << 20
+    node.order(publish="/compressed", fields={"data": {"repeat": [7, size]}})
+    (record,) = watcher.recorded(1)
+    assert record["data"]["data"] == {"sm3": sm3.digest(bytes([7]) * size).hex(), "length": size}
+
+
+def test_a_robot_that_is_too_slow_counts_what_it_could_not_take(ros: Graph):
+    count = 8000
+    node = ros.node("/base")
+    node.order(create="/flood", type=NUMBER, depth=count)
+    node.order(create="/odom", type=STRING)
+    watcher = ros.watcher('topics = ["/flood", "/odom"]', "hold")
+    for topic in ("/flood", "/odom"):
+        node.order(**{"await": topic})
+    node.order(publish="/odom", fields={"data": "0"})
+    node.order(burst="/flood", count=count)
+    node.order(publish="/odom", fields={"data": "1"})
+    watcher.says("/flood: messages arrive faster than they are taken")
+    watcher.process.stdin.close()  # from now on the robot takes what there is
+    watcher.until(
+        lambda: data_of(watcher.records, "/flood")[-1:] == [{"data": count - 1}]
+        and len(data_of(watcher.records, "/odom")) == 2,
+        "the last message",
+    )
+    statistics = watcher.stop()
+    flood, taken = statistics["/flood"], len(data_of(watcher.records, "/flood"))
+    assert flood["dropped"] > 0
+    assert flood["received"] + flood["lost"] == count
+    assert flood["received"] - flood["dropped"] == taken
+    assert statistics["/odom"] == {"received": 2, "lost": 0, "dropped": 0, "foreign": 0}
+    numbers = [data["data"] for data in data_of(watcher.records, "/flood")]
+    assert numbers == sorted(set(numbers))
+
+
+def test_what_cannot_be_decoded_is_told_and_does_no_harm(ros: Graph, tmp_path):
+    """A type that is not installed on the robot, and wstring, which rosbags does not read."""
+    shadow = tmp_path / "shadow" / "sensor_msgs"
+    shadow.mkdir(parents=True)
+    (shadow / "__init__.py").touch()
+    node = ros.node("/base")
+    node.order(create="/absent", type="sensor_msgs/msg/Imu", latched=True)
+    node.order(create="/wide", type="test_msgs/msg/WStrings", latched=True)
+    node.order(create="/good", type=STRING, latched=True)
+    for topic in ("/absent", "/wide", "/good"):
+        node.order(publish=topic)
+    path = os.pathsep.join([str(shadow.parent), ros.environment["PYTHONPATH"]])
+    watcher = ros.watcher('topics = ["/**"]', PYTHONPATH=path)
+    watcher.recorded(1)
+    watcher.says("/absent is left out: message type sensor_msgs/msg/Imu is not installed here; install package")
+    watcher.says("/wide is left out: test_msgs/msg/WStrings.wstring_value is a wstring")
+    assert "/good" in (watched := watcher.stop())
+    assert not {"/absent", "/wide"} & watched.keys()
+    assert len(watcher.errors) == len(set(watcher.errors))  # each is said once
+
+
+def test_the_robots_signals_and_threads_are_left_alone(ros: Graph):
+    watcher = ros.watcher('topics = ["/t"]')
+    assert '{"opened": "Ros2Source", "handlers_kept": true}' in watcher.lines
+    assert watcher.stop() == {}
+
+
+def test_a_domain_that_cannot_be_is_a_source_error(ros: Graph):
+    watcher = ros.watcher('topics = ["/t"]', ROS_DOMAIN_ID="nonsense")
+    assert watcher.finish() == 8
+    assert "the ROS 2 graph cannot be joined" in watcher.lines[0]
