@@ -102,6 +102,12 @@ class SM3:
         other._state = self._state.copy()
         return other
 
+    def __copy__(self) -> SM3:
+        return self.copy()
+
+    def __deepcopy__(self, memo: object) -> SM3:
+        return self.copy()
+
     def __repr__(self) -> str:
         return f"<SM3 hash ({ENGINE})>"
 

@@ -591,3 +591,20 @@ def test_a_private_key_is_not_pickled_and_cannot_be_changed() -> None:
 def test_public_values_can_be_pickled() -> None:
     for value in (public, leaf, *MODES):
         assert pickle.loads(pickle.dumps(value)) == value
+
+
+def test_copies_of_a_hash_are_independent() -> None:
+    for duplicate in (sm3.SM3.copy, copy.copy, copy.deepcopy):
+        state = sm3.SM3(b"a")
+        other = duplicate(state)
+        other.update(b"b")
+        assert state.digest() == sm3.digest(b"a") and other.digest() == sm3.digest(b"ab")
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_what_must_be_used_once_is_not_duplicated(duplicate: Callable[[Any], Any]) -> None:
+    stream = sm4.Cipher(KEY16, sm4.CTR(IV)).encryptor()
+    exchange = sm2.KeyExchange(key, b"", public, b"", initiator=True)
+    for thing in (stream, exchange):
+        with pytest.raises(TypeError, match="copied"):
+            duplicate(thing)

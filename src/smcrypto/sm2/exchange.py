@@ -13,6 +13,7 @@ is for the caller to know, by a certificate.
 from __future__ import annotations
 
 from hmac import compare_digest
+from typing import NoReturn
 
 from smcrypto import sm3
 from smcrypto.errors import ConfirmationError, InvalidKey, InvalidLength, OutOfOrder
@@ -146,3 +147,6 @@ class KeyExchange:
         expected, self._expected = self._expected, None
         if not compare_digest(expected, data):
             raise ConfirmationError("the peer did not arrive at the same key")
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("a key exchange is neither copied nor pickled: its ephemeral key serves one run")

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, NoReturn, Protocol, TypeAlias
 
 from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding
 from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
@@ -295,6 +295,9 @@ class CipherStream:
             raise AlreadyFinalized("this stream was finalized")
         transform, self._transform = self._transform, None
         return transform.finalize()
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("streams are neither copied nor pickled: two would go on with one state")
 
 
 @dataclass(frozen=True, slots=True)
