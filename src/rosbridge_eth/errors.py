@@ -23,6 +23,7 @@ class ExitCode(IntEnum):
     CHAIN = 7
     SOURCE = 8
     VERIFICATION = 9
+    PROCESS = 10
 
 
 class BridgeError(Exception):
@@ -71,3 +72,9 @@ class VerificationError(BridgeError):
     """What was read back is not what was written, or cannot be proven to be."""
 
     exit_code = ExitCode.VERIFICATION
+
+
+class ProcessError(BridgeError):
+    """A process of the server ends again and again as soon as it is started."""
+
+    exit_code = ExitCode.PROCESS

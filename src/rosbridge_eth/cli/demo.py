@@ -11,8 +11,9 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from rosbridge_eth.cli.output import Json, data, errors, log_to_stderr, print_json, table, talk
+from rosbridge_eth.cli.output import Json, data, errors, print_json, table, talk
 from rosbridge_eth.errors import VerificationError
+from rosbridge_eth.operations.logs import log_to_stderr
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -37,7 +38,7 @@ def demo(
     from rosbridge_eth.relay import Harm
     from rosbridge_eth.sources.sample import sample_bag
 
-    log_to_stderr(verbose=False)
+    log_to_stderr()
     chosen = bag or sample_bag()
     topics = topic or [f"/{ROBOT}/odom"]
     columns = (TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

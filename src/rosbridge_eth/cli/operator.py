@@ -12,12 +12,20 @@ from typing import Annotated, Any
 import typer
 
 from rosbridge_eth import ledger
-from rosbridge_eth.cli.options import OPERATOR_HOME, OperatorHomeOption, PassphraseFile, PasswordFile, Verbose
-from rosbridge_eth.cli.output import Json, data, log_to_stderr, print_json, table, talk
+from rosbridge_eth.cli.options import (
+    OPERATOR_HOME,
+    LogFormatOption,
+    OperatorHomeOption,
+    PassphraseFile,
+    PasswordFile,
+    Verbose,
+)
+from rosbridge_eth.cli.output import Json, data, print_json, table, talk
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.identity import Role
+from rosbridge_eth.operations.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
 
 _ETH = 10**18
@@ -218,14 +226,15 @@ def server(
     home: OperatorHomeOption = OPERATOR_HOME,
     workers: Annotated[int | None, typer.Option(min=1, max=64, help="Processes that share the port.")] = None,
     passphrase_file: PassphraseFile = None,
-    verbose: Verbose = False,
+    verbose: Verbose = 0,
+    log_format: LogFormatOption = LogFormat.TEXT,
 ) -> None:
     """Take records from robots and bring them onto the chain, until stopped."""
     from rosbridge_eth.ledger.accounts import Keyring
     from rosbridge_eth.server.administration import load_server_identity
     from rosbridge_eth.server.supervisor import Secrets, Supervisor
 
-    log_to_stderr(verbose)
+    log_to_stderr(log_format, verbose)
     place = OperatorHome(home).require()
     config = load_server_config(place.config)
     if workers is not None:

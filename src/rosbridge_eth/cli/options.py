@@ -7,6 +7,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
+from rosbridge_eth.operations.logs import LogFormat
+
 OperatorHomeOption: TypeAlias = Annotated[
     Path, typer.Option("--home", help="The operator's folder.", envvar="ROSBRIDGE_ETH_HOME", show_default=True)
 ]
@@ -24,7 +26,11 @@ PasswordFile: TypeAlias = Annotated[
     Path | None,
     typer.Option("--password-file", help="Read the robot's registration password from the first line of this file."),
 ]
-Verbose: TypeAlias = Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens on stderr.")]
+Verbose: TypeAlias = Annotated[
+    int,
+    typer.Option("--verbose", "-v", count=True, help="Log what happens on stderr; twice (-vv): every record, by name."),
+]
+LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option("--log-format", help="How a line of the log looks.")]
 
 OPERATOR_HOME = Path("operator")
 ROBOT_HOME = Path("robot")

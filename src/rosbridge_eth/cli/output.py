@@ -1,4 +1,4 @@
-"""How the commands speak: one console for talk (stderr), one for data (stdout), logs as plain lines."""
+"""How the commands speak: one console for talk (stderr), one for data (stdout); logs are operations.logs'."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from rosbridge_eth.operations.logs import speaks_json
+
+log = logging.getLogger(__name__)
+
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 data = Console(highlight=False)
 
@@ -19,7 +23,10 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
 def talk(text: str) -> None:
-    """A line for the person at the terminal; never parsed as markup."""
+    """A line for the person at the terminal; never parsed as markup. An event, where stderr carries JSON."""
+    if speaks_json():
+        log.warning("%s", text)
+        return
     errors.print(text, markup=False)
 
 
@@ -37,11 +44,3 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], 
         made.add_row(*(str(cell).replace("[", r"\[") for cell in row))
     return made
 
-
-def log_to_stderr(verbose: bool) -> None:
-    """Logs of a long-running command: time, level, message; records by their identity, never their content."""
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING,
-        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )

@@ -11,11 +11,12 @@ from typing import Annotated
 import typer
 
 from rosbridge_eth.bundle import open_bundle
-from rosbridge_eth.cli.options import ROBOT_HOME, PasswordFile, RobotHomeOption, Verbose
-from rosbridge_eth.cli.output import log_to_stderr, talk
+from rosbridge_eth.cli.options import ROBOT_HOME, LogFormatOption, PasswordFile, RobotHomeOption, Verbose
+from rosbridge_eth.cli.output import talk
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import RobotHome
+from rosbridge_eth.operations.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
 
 SOURCES = {
@@ -57,12 +58,14 @@ def robot(
     home: RobotHomeOption = ROBOT_HOME,
     config: Annotated[Path | None, typer.Option(help="Use this file instead of robot.toml.")] = None,
     password_file: PasswordFile = None,
-    verbose: Verbose = False,
+    verbose: Verbose = 0,
+    log_format: LogFormatOption = LogFormat.TEXT,
 ) -> None:
     """Watch the configured topics and bring what they say to the server, until stopped or the source ends."""
     from rosbridge_eth.robot.assembly import open_robot
+    from rosbridge_eth.robot.monitor import monitored
 
-    log_to_stderr(verbose)
+    log_to_stderr(log_format, verbose)
     place = RobotHome(home)
     end = place.bridge()
     settings = load_robot_config(config or place.config)
@@ -76,7 +79,8 @@ def robot(
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
     talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
-    running.run()
+    with monitored(running, settings.monitor) as on_turn:
+        running.run(on_turn=on_turn)
     counts = running.sender.statistics
     kept = running.spool_left
     talk(f"{running.recorder.times.records} captured, {counts.stored} stored by the server, {kept} kept for later.")

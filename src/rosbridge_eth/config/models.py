@@ -349,6 +349,11 @@ class RobotConfig(Section):
         default="stored",
         description="When a reliable record may leave the spool: stored durably by the server, or confirmed on chain.",
     )
+    monitor: HostPort | None = Field(
+        default=None,
+        description="HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there "
+        "are none. Keep it on the machine or a private network.",
+    )
     source: Annotated[SourceConfig | None, BeforeValidator(_known_kind)] = Field(
         default=None,
         description="Where messages come from (below). Without it, the ROS that the environment speaks of "
@@ -524,6 +529,11 @@ class ServerConfig(Section):
         default=["exchange"],
         min_length=1,
         description='Handshake modes that are taken: `"exchange"`, and `"transport"` where it is wanted.',
+    )
+    monitor: HostPort | None = Field(
+        default=None,
+        description="HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9464`; without it there "
+        "are none. Whoever reaches it reads names, balances and counts: keep it on the machine or a private network.",
     )
     chain: ChainConfig = Field(default=ChainConfig(), description="The node (below).")
     store: StoreConfig = Field(default=StoreConfig(), description="The inbox (below).")

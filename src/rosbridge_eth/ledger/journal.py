@@ -466,6 +466,10 @@ class Journal:
         dead = self._rows("SELECT 1 FROM dead_letter WHERE robot = ? AND stream = ? AND seq = ?", *_key(id))
         return RecordLocation(State.DEAD, 0, None, 0, 1, None, None) if dead else None
 
+    def count_dead_letters(self) -> int:
+        """How many there are, without reading them."""
+        return int(self._rows("SELECT count(*) FROM dead_letter")[0][0])
+
     def dead_letters(self) -> list[DeadLetter]:
         rows = self._rows("SELECT robot, stream, seq, ciphertext, reason, at FROM dead_letter ORDER BY at")
         return [

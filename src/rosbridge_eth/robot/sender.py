@@ -100,6 +100,7 @@ class Sender:
                 break
             message = self._client.send(protocol.encode_request(RecordRequest(records[0])))
             self._records[message] = records[0].id
+            log.debug("record %s: sent", records[0].id)
             self.statistics.sent += 1
 
     def _check(self, now: float) -> None:
@@ -149,6 +150,7 @@ class Sender:
         match ack:
             case Ack.STORED:
                 self.statistics.stored += 1
+                log.debug("record %s: stored by the server", id)
                 if self._wait_for_chain:
                     self._unconfirmed[id] = None
                     return

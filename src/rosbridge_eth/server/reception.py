@@ -37,6 +37,13 @@ _ACKS = {
     Outcome.FULL: Ack.BUSY,
 }
 
+_COUNTED = {
+    Outcome.NEW: "stored",
+    Outcome.DUPLICATE: "duplicate",
+    Outcome.CONFLICT: "conflict",
+    Outcome.FULL: "busy",
+}
+
 
 @dataclass(frozen=True, slots=True)
 class _Arrived:
@@ -62,6 +69,8 @@ class Reception:
         self._server, self._inbox = server, inbox
         self._status_of, self._registration_of = status_of, registration_of
         self.acks: Counter[Ack] = Counter()
+        self.counts: Counter[str] = Counter()
+        """Records by what became of them: stored, duplicate, conflict, busy, refused."""
         self.trouble: str | None = None
 
     def take(self, messages: Sequence[MessageReceived], *, wall: float, now: float) -> None:
@@ -78,6 +87,7 @@ class Reception:
                 case RecordRequest(record) if len(record.ciphertext) <= MAX_CIPHERTEXT:
                     arrived.append(_Arrived(message, record))
                 case RecordRequest():
+                    self.counts["refused"] += 1
                     self._acknowledge(message, Ack.REFUSED)
                 case CheckRequest(id):
                     self._reply(message, protocol.encode_answer(self._status_of(id)))
@@ -94,11 +104,14 @@ class Reception:
             if self.trouble is None:
                 log.error("records are not taken: %s", error)
             self.trouble = str(error)
+            self.counts["busy"] += len(arrived)
             for entry in arrived:
                 self._acknowledge(entry.message, Ack.BUSY)
             return
         self.trouble = None
         for entry, outcome in zip(arrived, outcomes, strict=True):
+            self.counts[_COUNTED[outcome]] += 1
+            log.debug("record %s: %s", entry.record.id, _COUNTED[outcome])
             if outcome is Outcome.CONFLICT:
                 log.error("record %s of %s: its identity is taken by other bytes", entry.record.id, entry.message.peer)
             self._acknowledge(entry.message, _ACKS[outcome])

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 
-from rosbridge_eth.channel import Event, MessageReceived, Server
+from rosbridge_eth.channel import AddressChanged, Connected, Disconnected, Event, MessageReceived, Server
 from rosbridge_eth.channel.udp import UdpLoop
 from rosbridge_eth.identity import PeerIdentity
 from rosbridge_eth.server.reception import Reception
@@ -34,20 +34,26 @@ class Worker:
         self._look_at = 0.0
 
     def _on_event(self, event: Event) -> None:
-        if isinstance(event, MessageReceived):
-            self._arrived.append(event)
-        else:
-            log.info("%s", event)
+        match event:
+            case MessageReceived():
+                self._arrived.append(event)
+            case Connected(peer=peer):
+                log.info("%s: session begun", peer)
+            case Disconnected(reason=reason, peer=peer):
+                log.info("%s: session ended, %s", peer, reason)
+            case AddressChanged(peer=peer):
+                log.info("%s: goes on from another address", peer)
 
     def _on_batch(self, now: float) -> None:
         arrived, self._arrived = self._arrived, []
         if arrived:
             self.reception.take(arrived, wall=time.time(), now=now)
 
-    def run(self, stopped: Callable[[], bool]) -> None:
-        """Until `stopped()`; then every session is ended in good order."""
+    def run(self, stopped: Callable[[], bool], *, on_turn: Callable[[], None] = lambda: None) -> None:
+        """Until `stopped()`; then every session is ended in good order. on_turn: called after every step."""
         while not stopped():
             self.loop.step(LONGEST_WAIT)
+            on_turn()
             now = time.monotonic()
             if now >= self._look_at:
                 self._look_at = now + LOOK_AT_LIST

@@ -1,0 +1,106 @@
+"""Logs on stderr: one event is one line, as text or JSON, with the records it is about and never what is in them.
+
+JSON has the members time (UTC), level, part, event, and, where there are any,
+records (robot/stream/seq in full) and failure (the exception's class and
+where it was raised). An exception's own text is shown only where the bridge
+wrote it: what others write may quote what they choked on.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import traceback
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any, TextIO
+
+from rosbridge_eth.errors import BridgeError
+from rosbridge_eth.records import RecordId
+
+LOGGER = "rosbridge_eth"
+LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+
+
+class LogFormat(StrEnum):
+    TEXT = "text"
+    JSON = "json"
+
+
+def identity(id: RecordId) -> str:
+    """A record's name in full: robot/stream/seq."""
+    return f"{id.robot.hex()}/{id.stream.hex()}/{id.seq}"
+
+
+def one_line(text: str) -> str:
+    """The text with line breaks and control characters written out: nobody's words can make a line of their own."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def _records(event: logging.LogRecord) -> Iterator[str]:
+    arguments = event.args if isinstance(event.args, tuple) else ()
+    yield from (identity(argument) for argument in arguments if isinstance(argument, RecordId))
+
+
+def _failure(event: logging.LogRecord) -> str:
+    if not event.exc_info or event.exc_info[1] is None:
+        return ""
+    error = event.exc_info[1]
+    said = f": {error}" if isinstance(error, BridgeError) else ""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = " < ".join(f"{frame.name} ({frame.filename.rpartition('/')[2]}:{frame.lineno})" for frame in frames[::-1])
+    return f"{type(error).__name__}{said} in {where}"
+
+
+def _time(event: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(event.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+class TextFormatter(logging.Formatter):
+    """`2026-11-21T10:00:00.000Z INFO server.worker: robot robot_1: session begun`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        failure = _failure(record)
+        text = record.getMessage() + (f" [{failure}]" if failure else "")
+        return f"{_time(record)} {record.levelname} {record.name.removeprefix(LOGGER + '.')}: {one_line(text)}"
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        event: dict[str, Any] = {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "part": record.name.removeprefix(LOGGER + "."),
+            "process": record.processName,
+            "event": record.getMessage(),
+        }
+        if records := list(_records(record)):
+            event["records"] = records
+        if failure := _failure(record):
+            event["failure"] = failure
+        return json.dumps(event)
+
+
+def log_to(stream: TextIO, format: LogFormat, verbosity: int) -> None:
+    """Send the bridge's logs to `stream`: warnings, with verbosity 1 what happens, with 2 every record.
+
+    Other packages' logs are shown from warnings on, whatever the verbosity:
+    theirs would name URLs and quote requests.
+    """
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(JsonFormatter() if format is LogFormat.JSON else TextFormatter())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger(LOGGER).setLevel(LEVELS[min(verbosity, len(LEVELS) - 1)])
+
+
+def log_to_stderr(format: LogFormat = LogFormat.TEXT, verbosity: int = 0) -> None:
+    log_to(sys.stderr, format, verbosity)
+
+
+def speaks_json() -> bool:
+    """Whether stderr carries JSON events, so that nothing else may stand there."""
+    return any(isinstance(handler.formatter, JsonFormatter) for handler in logging.getLogger().handlers)
