@@ -7,6 +7,7 @@ import hmac
 import io
 import os
 import pty
+import runpy
 import stat
 import subprocess
 import sys
@@ -63,6 +64,17 @@ def test_hash_reads_a_pipe() -> None:
     done = subprocess.run([sys.executable, "-m", "smcrypto", "hash"], input=b"abc", capture_output=True, check=True,
                           env=ENVIRONMENT)  # fmt: skip
     assert done.stdout == f"{ABC_DIGEST}  -\n".encode() and done.stderr == b""
+
+
+def test_it_runs_as_a_program_and_only_then(folder: Path, monkeypatch: pytest.MonkeyPatch,
+                                            capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["smcrypto", "hash", "message"])
+    runpy.run_module("smcrypto.__main__", run_name="imported")
+    assert capsys.readouterr().out == ""
+    with pytest.raises(SystemExit) as exit:
+        runpy.run_module("smcrypto", run_name="__main__")
+    assert exit.value.code == 0
+    assert capsys.readouterr().out == f"{sm3.digest(Path('message').read_bytes()).hex()}  message\n"
 
 
 def test_hash_and_hmac_of_many_files(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
