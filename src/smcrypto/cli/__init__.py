@@ -27,6 +27,7 @@ examples:
   python -m smcrypto verify --public pub.pem --signature message.sig message.txt
   python -m smcrypto encrypt --to pub.pem -o message.sm2 message.txt
   python -m smcrypto decrypt --key key.pem message.sm2
+  python -m smcrypto encrypt --password-file pass.txt -o backup.enc backup.tar
 """
 
 
