@@ -118,6 +118,14 @@ def test_the_readme_shows_every_part_of_the_library() -> None:
         assert name in code
 
 
+def test_the_guide_explains_every_error() -> None:
+    table = re.findall(r"^\| `(\w+)` \|", (DOCS / "smcrypto.md").read_text("utf-8").split("## Errors")[1], re.MULTILINE)
+    errors = {name for name in smcrypto.__all__ if isinstance(getattr(smcrypto, name), type)} - {"SMCryptoError"}
+    assert sorted(table) == sorted(errors)
+    no_value_errors = {name for name in errors if not issubclass(getattr(smcrypto, name), ValueError)}
+    assert set(table[-3:]) == no_value_errors  # as the sentence above the table says
+
+
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
 def test_docstrings_run(module: ModuleType) -> None:
     outcome = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL, verbose=False)
