@@ -70,6 +70,11 @@ class Registry:
             raise
         self._db.execute("COMMIT")
 
+    def revision(self) -> tuple[int, int]:
+        """Another value after every change, whichever process made it; cheap, so that readers can keep what they read."""
+        (others,) = self._db.execute("PRAGMA data_version").fetchone()
+        return int(others), self._db.total_changes
+
     def next_number(self) -> int:
         """The number the next enrolment will get: never used before, so no account is ever shared."""
         (highest,) = self._db.execute("SELECT coalesce(max(number), 0) FROM enrolment").fetchone()

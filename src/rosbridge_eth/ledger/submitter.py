@@ -362,26 +362,33 @@ class Submitter:
         return fresh
 
     def _round(self, head: Block, now: float) -> list[Action]:
-        accounts = self._accounts_in_use(now)
+        jobs = self._jobs_by_account()
+        accounts = self._accounts_in_use(jobs, now)
         deep = max(0, head.number - self._settings.confirmations + 1)
         stale = [a for a in accounts if self._views_of.get(a) != head.hash]
         if stale:
             return [ReadAccount(account, deep) for account in stale]
         wanted: list[Action] = list(self._blocks_to_check(head))
         for account in accounts:
-            wanted += self._for_account(account, head, now)
+            if self._operator is not None and account == self._operator.address:
+                jobs = self._jobs_by_account()  # with the top-ups that the others have just asked for
+            wanted += self._for_account(account, jobs.get(account, []), head, now)
         return wanted
 
-    def _accounts_in_use(self, now: float) -> list[str]:
-        """Accounts with something to do that this submitter may act for, the operator's last."""
-        names: dict[str, None] = {}
+    def _jobs_by_account(self) -> dict[str, list[Job]]:
+        jobs: dict[str, list[Job]] = {}
         for job in self._jobs.values():
             account = self._account_for(job)
             if account is not None:
-                names[account] = None
+                jobs.setdefault(account, []).append(job)
+        return jobs
+
+    def _accounts_in_use(self, jobs: Iterable[str], now: float) -> list[str]:
+        """Of the accounts with jobs those that this submitter may act for, the operator's last."""
+        names = list(jobs)
         if self._operator is not None and names:
-            names.pop(self._operator.address, None)
-            names[self._operator.address] = None
+            names = [name for name in names if name != self._operator.address]
+            names.append(self._operator.address)
         return [name for name in names if self._leased(name, now)]
 
     def _account_for(self, job: Job) -> str | None:
@@ -418,9 +425,8 @@ class Submitter:
             if number is not None and hash is not None and self._blocks_checked.get(number) != head.hash:
                 yield ReadBlock(number, hash)
 
-    def _for_account(self, account: str, head: Block, now: float) -> list[Action]:
+    def _for_account(self, account: str, mine: Sequence[Job], head: Block, now: float) -> list[Action]:
         view = self._views[account]
-        mine = [job for job in self._jobs.values() if self._account_for(job) == account]
         robot = next((job.robot for job in mine if job.kind is not Kind.TOP_UP), b"")
         with_nonce = sorted((job for job in mine if job.nonce is not None and job.state in _UNMINED), key=_nonce)
         for nonce in sorted({_nonce(job) for job in with_nonce if _nonce(job) < view.nonce}):

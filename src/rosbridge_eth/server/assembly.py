@@ -158,11 +158,16 @@ def submitter_settings(config: ServerConfig) -> Settings:
 def account_lookup(registry: Registry, keys: Keyring) -> Callable[[bytes], LocalAccount | None]:
     """For the submitter: the account a robot (Tk) signs with now, None for a name that is not in force."""
 
+    in_force: dict[bytes, int] = {}
+    revision: tuple[int, int] | None = None
+
     def account_of(robot: bytes) -> LocalAccount | None:
-        for enrolment in registry.all(Role.ROBOT):
-            if enrolment.revoked_at is None and robot_id(enrolment.name) == robot:
-                return keys.robot(enrolment.number)
-        return None
+        nonlocal in_force, revision
+        if (now := registry.revision()) != revision:  # read before the rows: a change in between is read again
+            in_force = {robot_id(e.name): e.number for e in registry.all(Role.ROBOT) if e.revoked_at is None}
+            revision = now
+        number = in_force.get(robot)
+        return None if number is None else keys.robot(number)
 
     return account_of
 

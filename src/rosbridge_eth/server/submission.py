@@ -23,7 +23,9 @@ log = logging.getLogger(__name__)
 LEASE = 60.0  # seconds; many times a batch's age
 LEASE_RECORDS = 512
 LEASE_BYTES = 1 << 20
-MAX_BACKLOG = 64  # batches on their way, above which the inbox keeps the rest
+GATHER_RECORDS = 4096  # held in open batches at most: with many robots that say little, a few from each
+GATHER_BYTES = 8 << 20  # taken over in one turn at most
+MAX_BACKLOG = 256  # batches on their way, above which the inbox keeps the rest; some 24 MiB at most
 DONE_KEPT = 30 * 86_400.0  # seconds for which finished identities are recognised as duplicates
 FORGET_EVERY = 3600.0
 SHORTEST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
@@ -72,18 +74,24 @@ class Submission:
 
     def _gather(self, now: float) -> bool:
         """Take waiting records over into open batches, while the chain keeps up."""
-        if self._submitter.backlog() >= MAX_BACKLOG or len(self._batcher) >= LEASE_RECORDS:
+        if self._submitter.backlog() >= MAX_BACKLOG:
             return False
-        leased = self._inbox.lease(
-            self._holder, limit=LEASE_RECORDS, max_bytes=LEASE_BYTES, now=now, ttl=LEASE
-        )
-        self.gathered += len(leased)
-        for entry in leased:
-            if refusal(entry.record, self._limits) is None:
-                self._batcher.add(entry.record, now)
-            else:
-                self._seal([entry.record], now)  # the journal keeps it as a dead letter, with the reason
-        return bool(leased)
+        held, taken = len(self._batcher), 0
+        while held < GATHER_RECORDS and taken < GATHER_BYTES:
+            # One robot's at a time.
+            leased = self._inbox.lease(
+                self._holder, limit=LEASE_RECORDS, max_bytes=LEASE_BYTES, now=now, ttl=LEASE
+            )
+            if not leased:
+                break
+            self.gathered += len(leased)
+            for entry in leased:
+                held, taken = held + 1, taken + len(entry.record.ciphertext)
+                if refusal(entry.record, self._limits) is None:
+                    self._batcher.add(entry.record, now)
+                else:
+                    self._seal([entry.record], now)  # the journal keeps it as a dead letter, with the reason
+        return taken > 0
 
     def _seal(self, batch: list[SealedRecord], now: float) -> None:
         sealing = self._submitter.seal(batch, now)
