@@ -12,7 +12,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -424,10 +424,11 @@ def terminal() -> Iterator[Callable[[], str]]:
         monkeypatch.setattr(sys, "stderr", stderr)
 
         def shown() -> str:
-            os.set_blocking(leader, False)
-            with suppress(BlockingIOError):
-                return os.read(leader, 1 << 16).decode()
-            return ""
+            print("END", file=stderr)  # a terminal delivers in order, though not at once
+            text = ""
+            while not text.endswith("END\r\n"):
+                text += os.read(leader, 1 << 16).decode()
+            return text.removesuffix("END\r\n")
 
         yield shown
     os.close(leader)
