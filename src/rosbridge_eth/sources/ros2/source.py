@@ -35,6 +35,8 @@ LOOK_EVERY: Final = 0.25
 """Seconds between looks at the graph: what a late topic publishes before is missed, unless it is latched."""
 KEEP: Final = 300.0
 """Seconds that a subscription outlives the last publisher."""
+OVERLAP: Final = 1.0
+"""Seconds that a subscription and the one that takes its place both run: publishers learn of a new one late."""
 UNMATCHED_AFTER: Final = 5.0
 """Seconds after which names that nothing publishes are told."""
 STOP_TIME: Final = 2.0
@@ -86,7 +88,10 @@ class _Topic:
     generated: Any
     decoder: Decoder
     quality: Quality
+    subscriptions: int = 0  # so far
     subscription: Any = None
+    leaving: Any = None  # the subscription that `subscription` takes the place of
+    leaves_at: float = 0.0
     type_hash: str | None = None
     publishers: frozenset[bytes] = frozenset()
     foreign: frozenset[bytes] = frozenset()
@@ -241,14 +246,13 @@ class Ros2Source:
         changes = self._watch.update([*offers, *waiting], now)
         for offer in changes.removed:
             if (gone := self._topics.pop((offer.topic, offer.type_name), None)) is not None:
-                self._node.destroy_subscription(gone.subscription)
-                log.info("%s: left", offer.topic)
+                self._leave(gone)
         for offer in changes.added:
             self._join(offer, publishers.get((offer.topic, offer.type_name), []), now)
         for key, topic in self._topics.items():
             found = publishers.get(key, [])
             self._know(topic, found)
-            self._adapt(topic, found)
+            self._adapt(topic, found, now)
 
     def _read_graph(self) -> tuple[list[Offer], dict[tuple[str, str], list[Any]]]:
         offers: list[Offer] = []
@@ -334,30 +338,48 @@ class Ros2Source:
         for gone in topic.sequence.keys() - present.keys():
             del topic.sequence[gone]
 
-    def _adapt(self, topic: _Topic, publishers: Sequence[Any]) -> None:
-        """Subscribe anew if the publishers offer more or less than is asked for."""
+    def _adapt(self, topic: _Topic, publishers: Sequence[Any], now: float) -> None:
+        """Subscribe anew if the publishers offer more or less than is asked for.
+
+        Where messages are numbered, nothing is lost or repeated by that: both
+        subscriptions run for a while, and what both bring is taken once.
+        """
+        if topic.leaving is not None:
+            if now >= topic.leaves_at:
+                self._drain(topic)
+                self._node.destroy_subscription(topic.leaving)
+                topic.leaving = None
+            return
         wanted = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
         if not publishers or wanted == topic.quality:
             return
-        weaker = (topic.quality.reliable and not wanted.reliable) or (topic.quality.latched and not wanted.latched)
-        if weaker or topic.numbered:  # else: latched messages would come again, and nothing tells that they were seen
-            self._change(topic, wanted)
-
-    def _change(self, topic: _Topic, wanted: Quality) -> None:
-        """Subscribe anew, with other quality. Where messages are numbered, nothing is lost or repeated by it."""
-        old = topic.subscription
-        if not topic.numbered:
-            self._node.destroy_subscription(old)
-        topic.subscription = self._subscribe(topic, wanted)
         if topic.numbered:
-            while (waiting := _take(old, topic.generated)) is not None:
-                self._arrived(topic, *waiting)
-            self._node.destroy_subscription(old)
+            topic.leaving, topic.leaves_at = topic.subscription, now + OVERLAP
+        elif (topic.quality.reliable and not wanted.reliable) or (topic.quality.latched and not wanted.latched):
+            self._node.destroy_subscription(topic.subscription)
+        else:
+            return  # asking for more would bring latched messages again, and nothing tells that they were seen
+        topic.subscription, topic.quality = self._subscribe(topic, wanted), wanted
         log.info("%s: publishers changed, now watched as %s", topic.offer.topic, wanted)
-        topic.quality = wanted
+
+    def _drain(self, topic: _Topic) -> None:
+        """Take what the leaving subscription holds, which is older than what the new one brings."""
+        while (waiting := _take(topic.leaving, topic.generated)) is not None:
+            self._arrived(topic, *waiting)
+
+    def _leave(self, topic: _Topic) -> None:
+        for subscription in (topic.subscription, topic.leaving):
+            if subscription is not None:
+                self._node.destroy_subscription(subscription)
+        log.info("%s: left", topic.offer.topic)
 
     def _callback(self, topic: _Topic) -> Callable[[bytes, Any], None]:
+        topic.subscriptions += 1
+        number = topic.subscriptions
+
         def arrived(raw: bytes, info: Any) -> None:
+            if topic.leaving is not None and number == topic.subscriptions:
+                self._drain(topic)
             self._arrived(topic, raw, info)
 
         return arrived

@@ -91,6 +91,15 @@ class Program:
             reader.join(PATIENCE)
         return code
 
+    def leave(self) -> None:
+        """End in good order: what is killed is missed by Fast DDS for a while, and leaves its shared memory behind."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.communicate(timeout=5)
+            except (subprocess.TimeoutExpired, ValueError):
+                self.kill()
+
     def kill(self) -> None:
         self.process.kill()
         self.process.wait(PATIENCE)
@@ -168,7 +177,7 @@ class Graph:
         }
 
     def _keep(self, program: Program) -> None:
-        self._ends.callback(program.kill)
+        self._ends.callback(program.leave)
 
     def node(self, name: str, **environment: str) -> Node:
         node = Node([self._python, str(HERE / "publishing.py"), name], {**self.environment, **environment})

@@ -12,7 +12,9 @@ Each is answered by a line with "ok". The end of stdin ends it.
 
 from __future__ import annotations
 
+import atexit
 import json
+import signal
 import sys
 import time
 from importlib import import_module
@@ -37,6 +39,7 @@ def fill(message: object, fields: dict[str, object]) -> object:
     return message
 
 
+signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))
 context = Context()
 context.init(args=[], initialize_logging=False)
 namespace, _, name = sys.argv[1].rpartition("/")
@@ -44,6 +47,14 @@ node = Node(name, context=context, namespace=namespace or "/", start_parameter_s
 publishers: dict[str, object] = {}
 types: dict[str, type] = {}
 print("ok", flush=True)
+
+
+def leave() -> None:
+    node.destroy_node()
+    context.try_shutdown()
+
+
+atexit.register(leave)
 for line in sys.stdin:
     order = json.loads(line)
     if "create" in order:
@@ -78,5 +89,3 @@ for line in sys.stdin:
     elif "destroy" in order:
         node.destroy_publisher(publishers.pop(order["destroy"]))
     print("ok", flush=True)
-node.destroy_node()
-context.try_shutdown()

@@ -231,13 +231,13 @@ def test_ten_topics_at_100_hz_lose_nothing(ros: Graph):
     watcher = ros.watcher('topics = ["/odom_*"]')
     for topic in topics:
         node.order(**{"await": topic})
-    node.order(burst=topics, count=300, rate=100)
-    watcher.recorded(3000)
+    node.order(burst=topics, count=200, rate=100)
+    watcher.recorded(2000)
     statistics = watcher.stop()
-    assert statistics == {topic: {"received": 300, "lost": 0, "dropped": 0, "foreign": 0} for topic in topics}
+    assert statistics == {topic: {"received": 200, "lost": 0, "dropped": 0, "foreign": 0} for topic in topics}
     for topic in topics:
         stamps = [data["header"]["stamp"] for data in data_of(watcher.records, topic)]
-        assert stamps == [second * 10**9 for second in range(300)]
+        assert stamps == [second * 10**9 for second in range(200)]
 
 
 def test_huge_messages_arrive_whole(ros: Graph):
@@ -252,11 +252,11 @@ def test_huge_messages_arrive_whole(ros: Graph):
 
 
 def test_a_robot_that_is_too_slow_counts_what_it_could_not_take(ros: Graph):
-    count = 8000
+    count = 6000
     node = ros.node("/base")
     node.order(create="/flood", type=NUMBER, depth=count)
     node.order(create="/odom", type=STRING)
-    watcher = ros.watcher('topics = ["/flood", "/odom"]', "hold")
+    watcher = ros.watcher(f'topics = ["/flood", "/odom"]\n[source]\nkind = "ros2"\ndepth = {count}', "hold")
     for topic in ("/flood", "/odom"):
         node.order(**{"await": topic})
     node.order(publish="/odom", fields={"data": "0"})
@@ -270,13 +270,29 @@ def test_a_robot_that_is_too_slow_counts_what_it_could_not_take(ros: Graph):
         "the last message",
     )
     statistics = watcher.stop()
-    flood, taken = statistics["/flood"], len(data_of(watcher.records, "/flood"))
-    assert flood["dropped"] > 0
-    assert flood["received"] + flood["lost"] == count
-    assert flood["received"] - flood["dropped"] == taken
-    assert statistics["/odom"] == {"received": 2, "lost": 0, "dropped": 0, "foreign": 0}
     numbers = [data["data"] for data in data_of(watcher.records, "/flood")]
+    dropped = count - len(numbers)
+    assert dropped > 0
+    assert statistics["/flood"] == {"received": count, "lost": 0, "dropped": dropped, "foreign": 0}
+    assert statistics["/odom"] == {"received": 2, "lost": 0, "dropped": 0, "foreign": 0}
     assert numbers == sorted(set(numbers))
+
+
+def test_what_the_middleware_loses_is_counted(ros: Graph):
+    """A queue of one message, and a burst: most of it is overwritten before it can be taken."""
+    node = ros.node("/base")
+    node.order(create="/t", type=NUMBER, depth=1)
+    watcher = ros.watcher('topics = ["/t"]\n[source]\nkind = "ros2"\ndepth = 1')
+    node.order(**{"await": "/t"})
+    node.order(publish="/t", fields={"data": 10_000})
+    watcher.recorded(1)
+    node.order(burst="/t", count=2000)
+    watcher.until(lambda: {"data": 1999} in data_of(watcher.records, "/t"), "the last message")
+    watcher.says("/t: messages were lost on their way here")
+    (counts,) = watcher.stop().values()
+    assert counts["lost"] > 0
+    assert counts["received"] + counts["lost"] == 2001
+    assert counts["received"] == len(watcher.records)
 
 
 def test_what_cannot_be_decoded_is_told_and_does_no_harm(ros: Graph, tmp_path):
