@@ -6,7 +6,8 @@
                                         take the list of publishers from the master's answer. Anyone may call
                                         our API, so nothing is believed from there.
     other publishers in the state       the doorbell did not reach us (a firewall): register again as well
-    we are missing in the state         the master has restarted, or another node took our name
+    we are missing in the state         the master has restarted
+    our name has another API            another node took it, and the master has dropped us: we take another one
 
 Publishers do not register again at a restarted master. So a connection that was
 there before is kept until it ends by itself, although the new master does not list it.
@@ -119,7 +120,7 @@ class Subscriptions:
         self._leaving: dict[str, None] = {}
         self._state: tuple[dict[str, list[str]], dict[str, list[str]]] | None = None
         self._polling_since: float | None = None
-        self._name_in_doubt = False
+        self._named_since: float | None = None  # when the master first took our name
         self._master_retry_at = 0.0
         self._actions: list[Action] = []
 
@@ -146,7 +147,7 @@ class Subscriptions:
         ]
         if self._polling_since is None:
             timers.append(max(self._watch.next_timer() or 0.0, self._master_retry_at))
-        if len(self._calls) < PARALLEL_CALLS and not self._name_in_doubt:
+        if len(self._calls) < PARALLEL_CALLS:
             timers += [self._master_retry_at] if self._leaving else []
             timers += [
                 max(topic.not_before, self._master_retry_at)
@@ -187,12 +188,12 @@ class Subscriptions:
                 case "getTopicTypes":
                     self._resolve(topic_types(unwrap(answer)), now)
                 case "lookupNode":
-                    self._name_in_doubt = False
-                    if unwrap(answer) != self._api:
+                    if unwrap(answer) != self._api and self._named_before(self._polling_since):
                         self._take_another_name()
+                    self._call(MasterCall("getSystemState", (self.node,)))
         except Refusal as error:
             if call.method == "lookupNode":
-                self._name_in_doubt = False  # nobody has the name
+                self._call(MasterCall("getSystemState", (self.node,)))  # nobody has our name
             elif call.method == "registerSubscriber":
                 self._refused(call, str(error), now)
             else:
@@ -240,9 +241,7 @@ class Subscriptions:
         due = self._watch.next_timer()
         if self._polling_since is None and (due is None or now >= due):
             self._polling_since = now
-            self._call(MasterCall("getSystemState", (self.node,)))
-        if self._name_in_doubt:
-            return
+            self._call(MasterCall("lookupNode", (self.node, self.node)))
         while self._leaving and len(self._calls) < PARALLEL_CALLS:
             name = next(iter(self._leaving))
             del self._leaving[name]
@@ -266,11 +265,9 @@ class Subscriptions:
                 topic = self._topics.get(call.topic)
                 if topic is not None and topic.registration is not _Registration.GIVEN_UP:
                     topic.registration = _Registration.DUE
-            case "getSystemState" | "getTopicTypes":
+            case "lookupNode" | "getSystemState" | "getTopicTypes":
                 self._polling_since = None
                 self._watch.failed(now)
-            case "lookupNode":
-                self._name_in_doubt = False
 
     def _refused(self, call: MasterCall, why: str, now: float) -> None:
         self._say(f"register {call.topic}", f"the master does not take a subscription to {call.topic}: {why}")
@@ -287,6 +284,8 @@ class Subscriptions:
         rung = topic.registration is _Registration.RUNG
         topic.registration = _Registration.DUE if rung else _Registration.DONE
         topic.registered_at = now
+        if self._named_since is None and call.parameters[0] == self.node:
+            self._named_since = now
         self._say(f"register {call.topic}", None)
         for uri in [uri for uri in topic.connections if uri not in uris]:
             link = topic.connections[uri]
@@ -303,7 +302,7 @@ class Subscriptions:
                 self._say("room", f"more than {MAX_CONNECTIONS} publishers; those of {call.topic} are left out")
 
     def _judge_registrations(self, subscribers: dict[str, list[str]], now: float) -> None:
-        """Register again what the master does not know; it is not to be trusted with what it answered before."""
+        """Register again what the master does not know."""
         since = now if self._polling_since is None else self._polling_since
         for name, topic in self._topics.items():
             if (
@@ -316,9 +315,6 @@ class Subscriptions:
                     self._disconnect(name, topic, uri)
                 for link in topic.connections.values():
                     link.orphan = True
-                if not self._name_in_doubt:
-                    self._name_in_doubt = True
-                    self._call(MasterCall("lookupNode", (self.node, self.node)))
         for name, nodes in subscribers.items():
             if self.node in nodes and is_graph_name(name) and self._topics.get(name) is None:
                 self._leave(name)  # an earlier farewell did not reach the master
@@ -334,11 +330,15 @@ class Subscriptions:
                     topic.registration = _Registration.DUE
                 topic.nodes = nodes
 
+    def _named_before(self, moment: float | None) -> bool:
+        return self._named_since is not None and moment is not None and self._named_since < moment
+
     def _take_another_name(self) -> None:
         """Two nodes of one name would push each other out of the master in turn."""
         old = self.node
         self._renamed += 1
         self.node = f"{self._base_name}_{self._renamed + 1}"
+        self._named_since = None
         self._say(f"name {self.node}", f"another node has registered as {old}; this one goes on as {self.node}")
         for topic in self._topics.values():
             if topic.registration is not _Registration.GIVEN_UP:

@@ -1,0 +1,156 @@
+"""A real ROS 1 graph for the tests: Debian's master and real publishers as processes, and a Ros1Source that listens."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule
+from rosbridge_eth.sources import Selection
+from rosbridge_eth.sources.ros1 import Ros1Settings, Ros1Source
+
+SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
+PUBLISHERS = Path(__file__).with_name("publishers.py")
+PATIENCE = 20.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def eventually(condition: Callable[[], object], what: str, patience: float = PATIENCE) -> None:
+    """Wait until something holds that another process brings about."""
+    deadline = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {patience} s in vain: {what}"
+        time.sleep(0.02)
+
+
+class Graph:
+    """A master, and whatever is started with it. Every process is ended by `close`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self.environment = {
+            **{key: value for key, value in os.environ.items() if not key.startswith(("ROS", "PYTHON"))},
+            "ROS_MASTER_URI": self.uri, "ROS_IP": "127.0.0.1", "ROS_LOG_DIR": str(folder),
+            "PYTHONUNBUFFERED": "1", "PYTHONDONTWRITEBYTECODE": "1",
+        }  # fmt: skip
+        self.processes: list[subprocess.Popen[str]] = []
+        self.master: subprocess.Popen[str] | None = None
+
+    def start_master(self) -> None:
+        self.master = self.start("rosmaster", "--core", "-p", str(self.port))
+        eventually(self.answers, "the master starts")
+
+    def stop_master(self) -> None:
+        assert self.master is not None
+        self.kill(self.master)
+
+    def answers(self) -> bool:
+        try:
+            return bool(self.call("getPid")[0] == 1)
+        except OSError:
+            return False
+
+    def call(self, method: str, *parameters: str) -> list:
+        with xmlrpc.client.ServerProxy(self.uri) as master:
+            return getattr(master, method)("/test", *parameters)
+
+    def subscribers(self, topic: str) -> list[str]:
+        return next((nodes for name, nodes in self.call("getSystemState")[2][1] if name == topic), [])
+
+    def start(self, *command: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            command, env=self.environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
+        self.processes.append(process)
+        return process
+
+    def publish(self, node: str, *topics: dict, wait: bool = True) -> subprocess.Popen[str]:
+        """A rospy node, once it has registered its topics; see publishers.py."""
+        program = {"node": node, "wait": wait, "topics": topics}
+        process = self.start(SYSTEM_PYTHON, str(PUBLISHERS), json.dumps(program))
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    def kill(self, process: subprocess.Popen[str]) -> None:
+        """As a power cut: nobody is told."""
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+        if process in self.processes:
+            self.processes.remove(process)
+
+    def close(self) -> None:
+        for process in list(self.processes):
+            self.kill(process)
+
+
+class Listening:
+    """A source that runs in a thread; every message goes through Capture, as in a robot."""
+
+    def __init__(self, uri: str, topics: Sequence[str] = (), nodes: Sequence[str] = (), **settings: object) -> None:
+        chosen = replace(Ros1Settings(master=uri, hostname="127.0.0.1"), **settings)  # type: ignore[arg-type]
+        self.source = Ros1Source(chosen, Selection(topics, nodes))
+        self.capture = Capture([TopicRule("**", fields=("*",), limit=4096)])
+        self.raw: list[RawMessage] = []
+        self.data: dict[str, list] = {}
+        self.stop = threading.Event()
+        self.failure: list[BaseException] = []
+        self.before_taking: Callable[[], object] = lambda: None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Listening:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        self._thread.join(10)
+        assert not self._thread.is_alive()
+        if self.failure:
+            raise self.failure[0]
+
+    def _run(self) -> None:
+        try:
+            self.source.run(self._emit, self.stop)
+        except BaseException as error:
+            self.failure.append(error)
+
+    def _emit(self, raw: RawMessage) -> None:
+        self.before_taking()
+        self.raw.append(raw)
+        record = self.capture.process(raw, time.time_ns(), time.monotonic_ns())
+        assert record is not None
+        self.data.setdefault(raw.topic, []).append(record.data)
+
+    def count(self, topic: str) -> int:
+        return len(self.data.get(topic, ()))
+
+    def wait_for(self, topic: str, count: int, patience: float = PATIENCE) -> list:
+        eventually(
+            lambda: self.failure or self.count(topic) >= count,
+            f"{count} messages of {topic}; there are {self.count(topic)}",
+            patience,
+        )
+        return self.data.get(topic, [])
+
+    def numbers(self, topic: str) -> list[int]:
+        return [data["data"] for data in self.data.get(topic, ())]
