@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import hmac
+import importlib
 import io
 import os
 import pty
@@ -69,7 +70,8 @@ def test_hash_reads_a_pipe() -> None:
 def test_it_runs_as_a_program_and_only_then(folder: Path, monkeypatch: pytest.MonkeyPatch,
                                             capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     monkeypatch.setattr(sys, "argv", ["smcrypto", "hash", "message"])
-    runpy.run_module("smcrypto.__main__", run_name="imported")
+    monkeypatch.delitem(sys.modules, "smcrypto.__main__", raising=False)
+    importlib.import_module("smcrypto.__main__")
     assert capsys.readouterr().out == ""
     with pytest.raises(SystemExit) as exit:
         runpy.run_module("smcrypto", run_name="__main__")
