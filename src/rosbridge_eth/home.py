@@ -4,7 +4,7 @@ An operator's home (made by `init`):
 
     server.toml          settings of the server
     ca/ server/          the CA, and the server's identity; keys encrypted under the operator passphrase
-    readers/NAME/        readers' identities made here; `init` makes `owner`
+    readers/NAME/        readers' identities made here; `init` makes `owner`. Each folder is a reader's home (below)
     accounts.json        the seed of all Ethereum accounts, under the same passphrase
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
@@ -19,6 +19,12 @@ A robot's home (made by `join`):
     readers/*.pem        who may read what it writes
     spool.sqlite         records not acknowledged yet
     clock                the latest time the server proved (seconds since 1970), for robots without a clock battery
+
+A reader's home (made by `reader`, to be carried anywhere):
+
+    reader.toml          contract, node, and where the rest is
+    *.key.pem *.crt.pem  its keys, under its own passphrase, its certificates, and the CA's
+    public.pem           its two certificates, for robots that shall seal for it
 """
 
 from __future__ import annotations
@@ -27,6 +33,7 @@ import json
 import os
 import tempfile
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from rosbridge_eth.errors import ChainError, ConfigError
@@ -183,3 +190,40 @@ class RobotHome:
     def raise_clock_floor(self, seconds: float) -> None:
         if seconds > self.clock_floor():
             write_atomically(self.clock, f"{seconds:.0f}\n".encode())
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderHome:
+    """Paths of a reader's home."""
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        return self.path / "reader.toml"
+
+    @property
+    def public(self) -> Path:
+        return self.path / "public.pem"
+
+
+class HomeKind(StrEnum):
+    """Whose home a folder is."""
+
+    OPERATOR = "operator"
+    ROBOT = "robot"
+    READER = "reader"
+
+
+def kind_of(path: Path) -> HomeKind:
+    """Whose home this is, by the file that makes it one; ConfigError if it is nobody's."""
+    if OperatorHome(path).config.exists():
+        return HomeKind.OPERATOR
+    if RobotHome(path).bridge_file.exists():
+        return HomeKind.ROBOT
+    if ReaderHome(path).config.exists():
+        return HomeKind.READER
+    raise ConfigError(
+        f"{path} is nobody's home; `init --home` makes an operator's, `join BUNDLE --home` a robot's,"
+        " `reader NAME` a reader's"
+    )

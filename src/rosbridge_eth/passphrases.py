@@ -15,6 +15,13 @@ from pathlib import Path
 from rosbridge_eth.errors import IdentityError
 
 
+def credential(name: str, environment: Mapping[str, str] = os.environ) -> Path | None:
+    """The file in which the service manager hands over the passphrase called `name`, if it does."""
+    folder = environment.get("CREDENTIALS_DIRECTORY")
+    file = Path(folder, f"rosbridge-eth-{name}") if folder else None
+    return file if file is not None and file.exists() else None
+
+
 def read_passphrase(
     name: str, prompt: str, *, file: Path | None = None, confirm: bool = False,
     environment: Mapping[str, str] = os.environ,
@@ -24,10 +31,7 @@ def read_passphrase(
     Looked for in `file`, then as rosbridge-eth-NAME in the credentials folder, then asked for
     (twice with `confirm`). IdentityError where there is none to be had.
     """
-    folder = environment.get("CREDENTIALS_DIRECTORY")
-    credential = Path(folder, f"rosbridge-eth-{name}") if folder else None
-    if file is None and credential is not None and credential.exists():
-        file = credential
+    file = file or credential(name, environment)
     if file is not None:
         return _from_file(file)
     if not sys.stdin.isatty():

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import typer
 
-from rosbridge_eth.cli import demo, operator, reader, robot
+from rosbridge_eth.cli import demo, doctor, operator, reader, robot, status
 from rosbridge_eth.cli.output import talk
 from rosbridge_eth.errors import BridgeError, ExitCode
 
@@ -25,7 +25,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for part in (demo, operator, robot, reader):
+for part in (demo, operator, robot, reader, status, doctor):
     part.add_commands(app)
 
 

@@ -1,4 +1,4 @@
-"""The operator's commands: init, chain, deploy, register, reader, revoke, export, server, check, status."""
+"""The operator's commands: init, chain, deploy, register, reader, revoke, export, server, check."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rosbridge_eth.cli.options import (
     PasswordFile,
     Verbose,
 )
-from rosbridge_eth.cli.output import Json, data, print_json, table, talk
+from rosbridge_eth.cli.output import Json, print_json, talk
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import OperatorHome
@@ -41,7 +41,6 @@ def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth export robot_1 keystore.json")(export)
     app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
     app.command(epilog="Example: rosbridge-eth check robot_1 0f3a… 17")(check)
-    app.command()(status)
 
 
 def _passphrase(file: Path | None, *, confirm: bool = False) -> bytes:
@@ -169,7 +168,8 @@ def add_reader(
     ca = load_ca(place, _passphrase(passphrase_file))
     password = read_passphrase("reader", f"Passphrase of reader {name}", file=password_file, confirm=True)
     folder = enrol_reader(place, name, ca=ca, password=password, now=_now())
-    talk(f"The keys of reader {name} are in {folder}.")
+    talk(f"{folder} is the home of reader {name}; it can be carried elsewhere. Its reader.toml names the node to ask.")
+    talk(f"A robot registered before seals for it too once {folder / 'public.pem'} is in the robot's readers folder.")
 
 
 def revoke(
@@ -288,71 +288,3 @@ def check(
         typer.echo(f"{found.state}{where}" + ("" if proven is None else f"; the contract says {str(proven).lower()}"))
     if proven is False:
         raise VerificationError("the contract does not have the record that the store says it has")
-
-
-def status(home: OperatorHomeOption = OPERATOR_HOME, json: Json = False) -> None:
-    """What is where: names, queues, ages, dead letters, balances, the last block."""
-    from rosbridge_eth.registry import Registry
-    from rosbridge_eth.server.assembly import open_chain, open_inbox, open_journal
-
-    place = OperatorHome(home).require()
-    config = load_server_config(place.config)
-    names = Registry(place.registry).all()
-    report: dict[str, Any] = {
-        "names": [
-            {"role": n.role, "name": n.name, "account": n.account, "enrolled": n.enrolled_at.isoformat(),
-             "revoked": None if n.revoked_at is None else n.revoked_at.isoformat()}
-            for n in names
-        ],
-    }
-    if place.deployment_file.exists():
-        deployment = place.deployment()
-        inbox = open_inbox(config, place).statistics(time.time())
-        journal = open_journal(place, deployment)
-        report |= {
-            "contract": deployment.contract,
-            "chain": deployment.chain_id,
-            "inbox": {"waiting": inbox.waiting, "leased": inbox.leased, "done": inbox.done, "dead": inbox.dead,
-                      "bytes": inbox.bytes, "oldest_seconds": inbox.oldest_age},
-            "batches": {str(state): count for state, count in journal.counts().items()},
-            "dead_letters": len(journal.dead_letters()),
-        }
-        node = open_chain(config)
-        try:
-            report["block"] = node.head().number
-            operator = jsonlib.loads(place.accounts.read_bytes())["operator"]
-            accounts = [operator, *(n.account for n in names if n.account and n.revoked_at is None)]
-            report["balances"] = {account: node.balance(account) / _ETH for account in accounts}
-        except ledger.NodeFailure as failure:
-            report["node"] = str(failure)
-        finally:
-            node.close()
-    if json:
-        print_json(report)
-        return
-    _print_status(report)
-
-
-def _print_status(report: dict[str, Any]) -> None:
-    balances = report.get("balances", {})
-    rows = [
-        (n["role"], n["name"], n["account"] or "", f"{balances[n['account']]:.4f}" if n["account"] in balances else "",
-         "revoked" if n["revoked"] else "in force")
-        for n in report["names"]
-    ]
-    data.print(table("Names", ["role", "name", "account", "ETH", "state"], rows, right=[3]))
-    if "contract" not in report:
-        talk("No contract is deployed yet; run `deploy`.")
-        return
-    inbox = report["inbox"]
-    oldest = "" if inbox["oldest_seconds"] is None else f"{inbox['oldest_seconds']:.1f} s"
-    rows2 = [
-        ("contract", report["contract"]),
-        ("chain, block", f"{report['chain']}, {report.get('block', 'the node does not answer')}"),
-        ("inbox waiting", f"{inbox['waiting'] + inbox['leased']} (oldest {oldest or 'none'})"),
-        ("dead letters", inbox["dead"] + report["dead_letters"]),
-        *((f"batches {state}", count) for state, count in report["batches"].items()),
-    ]
-    data.print(table("Ledger", ["what", "value"], rows2))
-    if "node" in report:
-        talk(report["node"])

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from rosbridge_eth.bundle import Bundle, seal_bundle
 from rosbridge_eth.config import ServerConfig, load_server_config
 from rosbridge_eth.errors import ConfigError, IdentityError
-from rosbridge_eth.home import Deployment, OperatorHome, write_atomically
+from rosbridge_eth.home import Deployment, OperatorHome, ReaderHome, write_atomically
 from rosbridge_eth.identity import (
     CertificateAuthority,
     Identity,
@@ -76,7 +77,8 @@ def init_home(
     home.bundles.mkdir(mode=0o700)
     registry = Registry(home.registry)
     _enrol(home, registry, ca, Role.SERVER, server, home.server, passphrase, now)
-    _enrol(home, registry, ca, Role.READER, OWNER, home.reader(OWNER), passphrase, now)
+    owner = _enrol(home, registry, ca, Role.READER, OWNER, home.reader(OWNER), passphrase, now)
+    _publish_reader(home, owner)
     registry.close()
     Keyring.create().save(home.accounts, passphrase)
     write_atomically(home.config, server_toml(listen, public, chain_url, server).encode())
@@ -146,6 +148,13 @@ def deploy_contract(home: OperatorHome, chain: Chain, operator: Keyring) -> Depl
     contract = deploy(chain, operator.operator)
     deployment = _deployment(contract)
     home.save_deployment(deployment)
+    registry = Registry(home.registry)
+    try:
+        names = [reader.name for reader in readers(registry)]
+    finally:
+        registry.close()
+    for name in names:
+        write_reader_toml(home, name)
     return deployment
 
 
@@ -244,14 +253,40 @@ def readers(registry: Registry) -> Sequence[Enrolment]:
 def enrol_reader(
     home: OperatorHome, name: str, *, ca: CertificateAuthority, password: bytes, now: datetime
 ) -> Path:
-    """Make another reader's identity; robots that are registered from now on seal for it too."""
+    """Make another reader's home; robots that are registered from now on seal for it too."""
     registry = Registry(home.registry)
     try:
         registry.require_free(Role.READER, check_name(name))
-        _enrol(home, registry, ca, Role.READER, name, home.reader(name), password, now)
+        identity = _enrol(home, registry, ca, Role.READER, name, home.reader(name), password, now)
     finally:
         registry.close()
+    _publish_reader(home, identity)
+    if home.deployment_file.exists():
+        write_reader_toml(home, name)
     return home.reader(name)
+
+
+def _publish_reader(home: OperatorHome, reader: Identity) -> None:
+    """The certificates by which robots seal for this reader, in one file."""
+    certificates = reader.signing_certificate.to_pem() + reader.encryption_certificate.to_pem()
+    write_atomically(ReaderHome(home.reader(reader.name)).public, certificates)
+
+
+def write_reader_toml(home: OperatorHome, name: str) -> None:
+    """Make the folder of a reader one that can be carried elsewhere; needs the contract."""
+    deployment, node = home.deployment(), urlsplit(load_server_config(home.config).chain.url)
+    # Of the operator's node only scheme, host and port: what else stands in a URL is often a key.
+    host = f"{node.scheme}://{node.netloc.rpartition('@')[2]}" if node.scheme else "http://127.0.0.1:8545"
+    write_atomically(
+        ReaderHome(home.reader(name)).config,
+        (
+            "# A reader: rosbridge-eth read ROBOT --config reader.toml. docs/configuration.md describes every key.\n"
+            f'contract = "{deployment.contract}"\n'
+            'ca = "ca.crt.pem"\n'
+            'identity = "."\n'
+            f'chain = "{host}"  # any node of chain {deployment.chain_id}\n'
+        ).encode(),
+    )
 
 
 def revoke(home: OperatorHome, role: Role, name: str, *, keys: Keyring, chain: Chain, now: datetime) -> int | None:
