@@ -72,6 +72,7 @@ def test_it_runs_as_a_program_and_only_then(folder: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(sys, "argv", ["smcrypto", "hash", "message"])
     monkeypatch.delitem(sys.modules, "smcrypto.__main__", raising=False)
     importlib.import_module("smcrypto.__main__")
+    del sys.modules["smcrypto.__main__"]
     assert capsys.readouterr().out == ""
     with pytest.raises(SystemExit) as exit:
         runpy.run_module("smcrypto", run_name="__main__")
