@@ -262,11 +262,11 @@ class Ros2Source:
                 continue
             nodes: dict[str, set[str]] = {}
             for endpoint in self._node.get_publishers_info_by_topic(name):
-                node = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                node = _node_name(endpoint)
                 if node == self._full_name:
                     continue
                 found = nodes.setdefault(endpoint.topic_type, set())
-                if endpoint.node_name != _UNKNOWN_NODE and name not in _SHARED:
+                if node is not None and name not in _SHARED:
                     found.add(node)
                 publishers.setdefault((name, endpoint.topic_type), []).append(endpoint)
             offers += [Offer(name, kind, tuple(sorted(found))) for kind, found in sorted(nodes.items())]
@@ -285,7 +285,6 @@ class Ros2Source:
             self._unusable.add(key)
             log.warning("%s is left out: %s", offer.topic, error)
             return
-        topic.type_hash = self._own_type_hash(offer)
         self._topics[key] = topic
         log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)
 
@@ -318,13 +317,14 @@ class Ros2Source:
     def _own_type_hash(self, offer: Offer) -> str | None:
         """The hash of the type as it is installed here, which our own subscription advertises."""
         for endpoint in self._node.get_subscriptions_info_by_topic(offer.topic):
-            node = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-            if node == self._full_name and endpoint.topic_type == offer.type_name:
+            if _node_name(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
                 return _type_hash(endpoint)
         return None
 
     def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
         """Who publishes the topic now, and who of them with another definition of its type."""
+        if topic.type_hash is None:
+            topic.type_hash = self._own_type_hash(topic.offer)
         present = {bytes(endpoint.endpoint_gid): endpoint for endpoint in publishers}
         topic.publishers = frozenset(present)
         foreign = {
@@ -419,15 +419,14 @@ class Ros2Source:
 
     def _tell_foreign(self, topic: _Topic, endpoint: Any) -> None:
         if self._first(topic.offer.topic, _type_hash(endpoint) or ""):
+            kind = topic.offer.type_name
             log.warning(
-                "%s: %s%s%s publishes with another definition of %s than is installed here; its messages are left out "
-                "and counted. Build both from the same version of package %s",
+                "%s: %s publishes with another definition of %s than is installed here; its messages are left out and "
+                "counted. Build both from the same version of package %s",
                 topic.offer.topic,
-                endpoint.node_namespace,
-                "" if endpoint.node_namespace.endswith("/") else "/",
-                endpoint.node_name,
-                topic.offer.type_name,
-                topic.offer.type_name.partition("/")[0],
+                _node_name(endpoint) or "somebody",
+                kind,
+                kind.partition("/")[0],
             )
 
     def _tell_unmatched(self) -> None:
@@ -492,6 +491,13 @@ def _take(subscription: Any, generated: Any) -> tuple[bytes, Mapping[str, Any]] 
     with subscription.handle:
         taken: tuple[bytes, Mapping[str, Any]] | None = subscription.handle.take_message(generated, True)
     return taken
+
+
+def _node_name(endpoint: Any) -> str | None:
+    """With its namespace; None while the graph has heard of the publisher, but not yet of its node."""
+    if endpoint.node_name == _UNKNOWN_NODE:
+        return None
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 def _type_hash(endpoint: Any) -> str | None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 from collections import Counter
+from pathlib import Path
 
 import pytest
 from rosbags.rosbag1 import Reader
@@ -326,3 +328,44 @@ def test_a_domain_that_cannot_be_is_a_source_error(ros: Graph):
     watcher = ros.watcher('topics = ["/t"]', ROS_DOMAIN_ID="nonsense")
     assert watcher.finish() == 8
     assert "the ROS 2 graph cannot be joined" in watcher.lines[0]
+
+
+def test_a_publisher_with_another_definition_is_left_out_and_the_others_are_heard(ros: Graph, tmp_path):
+    """Its message package is of another version: the hash of the type that it advertises says so.
+
+    The other version is the genuine library with one bit of that hash changed.
+    """
+    kind = "test_msgs/msg/Builtins"
+    library, advertised = json.loads(ros.run(FIND_HASH))
+    content = Path(library).read_bytes()
+    hash = bytes.fromhex(advertised.removeprefix("RIHS01_"))
+    assert hash in content
+    other = tmp_path / Path(library).name
+    other.write_bytes(content.replace(hash, bytes([hash[0] ^ 1]) + hash[1:]))
+    swapped = {"LD_PRELOAD": str(other), "LD_LIBRARY_PATH": str(Path(library).parent)}
+    node, stranger = ros.node("/base"), ros.node("/ns/stranger", **swapped)
+    for publisher in (stranger, node):
+        publisher.order(create="/t", type=kind, latched=True)
+    stranger.order(publish="/t", fields={"time_value": {"sec": 666}})
+    node.order(publish="/t", fields={"time_value": {"sec": 1}})
+    watcher = ros.watcher('topics = ["/t"]')
+    watcher.says("publishes with another definition of test_msgs/msg/Builtins than is installed here")
+    late = ros.node("/late", **swapped)
+    late.order(create="/t", type=kind)
+    late.order(**{"await": "/t"})
+    late.order(burst="/t", count=10)
+    node.order(publish="/t", fields={"time_value": {"sec": 2}})
+    watcher.recorded(2)
+    node.order(publish="/t", fields={"time_value": {"sec": 3}})
+    assert [data["time_value"] for data in data_of(watcher.recorded(3), "/t")] == [10**9, 2 * 10**9, 3 * 10**9]
+    assert watcher.stop()["/t"] == {"received": 3, "lost": 0, "dropped": 0, "foreign": 11}
+
+
+FIND_HASH = """
+import json, sys
+from pathlib import Path
+lib, share = Path(sys.prefix, "lib"), Path(sys.prefix, "share")
+hashes = json.loads((share / "test_msgs/msg/Builtins.json").read_text())["type_hashes"]
+(found,) = [each["hash_string"] for each in hashes if each["type_name"] == "test_msgs/msg/Builtins"]
+print(json.dumps([str(lib / "libtest_msgs__rosidl_generator_c.so"), found]))
+"""
