@@ -76,6 +76,10 @@ class TokenBucket:
             self._at = now
         return self.level
 
+    def ready_at(self) -> float:
+        """When `available` will be above zero, if nothing is charged until then; to be asked after `available`."""
+        return self._at + max(0.0, -self.level) / self.rate + 0.001
+
     def charge(self, amount: float) -> None:
         self.level = min(self.burst, self.level - amount)
 

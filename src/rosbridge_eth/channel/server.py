@@ -73,10 +73,11 @@ def _wall() -> datetime:
 class _HalfOpen:
     """A handshake with a good cookie: pieces of its PROOF, then the OFFER and the connection it made."""
 
-    __slots__ = ("assembly", "began", "connection", "nonce", "offer", "offered_at", "state")
+    __slots__ = ("assembly", "began", "connection", "nonce", "offer", "offered_at", "state", "waits")
 
     def __init__(self, nonce: bytes, now: float) -> None:
         self.state = ServerState.ASSEMBLING
+        self.waits = False  # its PROOF is whole, and stands in line for its share of the time
         self.nonce = nonce
         self.began = now
         self.assembly = Assembly()
@@ -152,6 +153,7 @@ class Server:
         self._events: deque[Event] = deque()
         self._outbox: list[tuple[bytes, Address]] = []
         self._half_open: OrderedDict[tuple[Address, bytes], _HalfOpen] = OrderedDict()
+        self._line: deque[tuple[_HalfOpen, tuple[Address, bytes], Piece, bytes]] = deque()
         self._finished: OrderedDict[bytes, float] = OrderedDict()  # client nonces, until their cookies expire
         self._connections: dict[bytes, _Connection] = {}
         self._by_peer: dict[tuple[Role, str], bytes] = {}
@@ -253,6 +255,8 @@ class Server:
         if self._half_open:
             oldest = next(iter(self._half_open.values()))
             times.append(oldest.began + self.config.half_open_timeout)
+        if self._line:
+            times.append(self._share.ready_at())
         return min(times, default=None)
 
     def handle_timer(self, now: float) -> None:
@@ -262,11 +266,18 @@ class Server:
             if now < oldest.began + self.config.half_open_timeout:
                 break
             oldest.state = advance(SERVER, oldest.state, ServerInput.EXPIRED)
+            if oldest.waits:
+                self._counters.drop(Drop.BUSY)
             if oldest.connection is not None:
                 self._forget(oldest.connection)
             self._half_open.pop(key, None)
         while self._finished and now > next(iter(self._finished.values())) + self.config.cookie_lifetime:
             self._finished.popitem(last=False)
+        while self._line and self._share.available(now) > 0:
+            half_open, key, piece, body = self._line.popleft()
+            if half_open.state is ServerState.ASSEMBLING:
+                half_open.waits = False
+                self._answer_proof(piece, body, key, half_open, now)
         while self._timers and self._timers[0][0] <= now:
             when, _, cid = heapq.heappop(self._timers)
             connection = self._connections.get(cid)
@@ -338,6 +349,8 @@ class Server:
                 half_open.offered_at = now
                 self._outbox += [(datagram, address) for datagram in half_open.offer]
             return
+        if half_open.waits:
+            return
         try:
             body = half_open.assembly.add(piece.index, piece.count, piece.data)
         except Malformed:
@@ -345,14 +358,22 @@ class Server:
             raise
         if body is None:
             return
-        if self._share.available(now) <= 0:
-            drop(Drop.BUSY)
+        if self._line or self._share.available(now) <= 0:
+            # Many robots begin at once, after a power cut: in line they are served as fast as the share allows,
+            # turned away they would come back later and later. The line is no longer than max_half_open.
+            half_open.waits = True
+            self._line.append((half_open, key, piece, body))
             return
-        began = self._stopwatch()
         self._answer_proof(piece, body, key, half_open, now)
-        self._share.charge(self._stopwatch() - began)
 
     def _answer_proof(
+        self, piece: Piece, body: bytes, key: tuple[Address, bytes], half_open: _HalfOpen, now: float
+    ) -> None:
+        began = self._stopwatch()
+        self._examine_proof(piece, body, key, half_open, now)
+        self._share.charge(self._stopwatch() - began)
+
+    def _examine_proof(
         self, piece: Piece, body: bytes, key: tuple[Address, bytes], half_open: _HalfOpen, now: float
     ) -> None:
         address = key[0]

@@ -7,12 +7,25 @@ behind; afterwards the honest message still works.
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 from datetime import timedelta
 
 import pytest
 
 from bridge.channel.steps import HERE, OPEN, Steps, dropped, events, flipped
-from bridge.channel.world import BIRTH, TODAY, authority, hub, identity, make_client, make_server, robot, trust
+from bridge.channel.world import (
+    BIRTH,
+    TODAY,
+    authority,
+    cookie_key,
+    hub,
+    identity,
+    make_client,
+    make_server,
+    robot,
+    trust,
+    wall,
+)
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import (
     ClientConfig,
@@ -25,6 +38,7 @@ from rosbridge_eth.channel import (
     Mode,
     Randomness,
     Reason,
+    Server,
     ServerConfig,
 )
 from rosbridge_eth.channel.handshake import (
@@ -382,26 +396,53 @@ def test_many_robots_behind_one_address_are_not_slowed_down():
     assert server.statistics().connections == 8
 
 
-def test_handshakes_take_their_share_of_time_and_no_more():
-    reading = [0.0]
+def busy_server(seconds: float, config: ServerConfig) -> tuple[Server, Callable[[], int]]:
+    """A server on a machine where each handshake takes so long, and how many PROOFs it has examined."""
+    reading = [0]
 
     def stopwatch() -> float:
-        reading[0] += 0.05  # a handshake takes 50 ms on this machine
-        return reading[0]
+        reading[0] += 1
+        return reading[0] * seconds
 
-    from bridge.channel.world import cookie_key, wall
-    from rosbridge_eth.channel import Server
-
-    config = ServerConfig(handshake_share=0.5, **OPEN)
     server = Server(config, hub(), trust(), cookie_key(hub()), 1000.0, wall=wall, stopwatch=stopwatch)
-    done = 0
+    return server, lambda: reading[0] // 2
+
+
+def test_handshakes_take_their_share_of_time_and_no_more():
+    server, examined = busy_server(0.05, ServerConfig(handshake_share=0.5, max_half_open=1000, **OPEN))
     for tenth in range(100):
+        now = 1000.0 + tenth / 10
+        server.handle_timer(now)
+        server.datagrams_to_send(now)
         for _ in range(3):
-            steps = Steps(server=server, now=1000.0 + tenth / 10)
-            done += bool(steps.until_offer())
-            server._half_open.clear()
-    assert dropped(server)[Drop.BUSY] > 100
-    assert 90 <= done <= 110  # ten seconds, half of them, at 50 ms, and the burst
+            Steps(server=server, now=now).until_offer()
+    assert 90 <= examined() <= 110  # ten seconds, half of them, at 50 ms, and the burst
+    server.handle_timer(1100.0)
+    assert dropped(server)[Drop.BUSY] == 300 - examined()  # forgotten in the line
+
+
+def test_handshakes_for_which_there_is_no_time_yet_stand_in_line_and_are_answered_in_order_unasked():
+    server, examined = busy_server(0.1, ServerConfig(handshake_share=0.5, **OPEN))
+    robots = [Steps(server=server, client=make_client(1000.0, None, robot(f"robot_{n}"))) for n in range(12)]
+    answered: list[tuple[str, int]] = []
+
+    def deliver(now: float) -> None:
+        answered.extend(address for _, address in server.datagrams_to_send(now) if address not in answered)
+
+    for number, steps in enumerate(robots):
+        source = ("198.51.100.7", 1000 + number)
+        proof = steps.to_client(*steps.to_server(steps.hello, source=source))
+        for data in [*proof, *proof]:  # what is repeated takes no second place
+            server.receive_datagram(data, source, 1000.0)
+        deliver(1000.0)
+    assert 0 < examined() < 12
+    while examined() < 12:
+        now = server.next_timer()
+        assert now is not None and now < 1003.0
+        server.handle_timer(now)
+        deliver(now)
+    assert answered == [("198.51.100.7", 1000 + number) for number in range(12)]
+    assert dropped(server) == {}
 
 
 def test_half_open_handshakes_are_few_and_forgotten():
