@@ -83,4 +83,6 @@ def robot(
         running.run(on_turn=on_turn)
     counts = running.sender.statistics
     kept = running.spool_left
-    talk(f"{running.recorder.times.records} captured, {counts.stored} stored by the server, {kept} kept for later.")
+    missed = f", {running.dropped} dropped because they came too fast" if running.dropped else ""
+    captured = running.recorder.times.records
+    talk(f"{captured} captured{missed}, {counts.stored} stored by the server, {kept} kept for later.")

@@ -62,6 +62,11 @@ class Robot:
         self._stop.set()
         self.loop.wake()
 
+    @property
+    def dropped(self) -> int:
+        """Messages of a live source that this robot was too slow to capture, so far."""
+        return sum(self._source.dropped.values())
+
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
 

@@ -89,6 +89,11 @@ class BagSource:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
         return self._offers
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """None: it waits for whoever takes its messages."""
+        return {}
+
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration before the replay."""
         found: dict[str, list[Decoder]] = {}

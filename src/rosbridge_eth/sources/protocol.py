@@ -39,6 +39,10 @@ class Source(Protocol):
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of the chosen topics as far as they are known before the first message; a live source: none."""
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Messages received but not emitted, `emit` being too slow, by topic; only a live source drops."""
+
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit messages in receive order until the source ends or `stop` is set. Raises SourceError."""
 

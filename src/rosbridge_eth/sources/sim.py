@@ -103,6 +103,11 @@ class SimSource:
         """Odometry and IMU."""
         return self._offers
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """None: it waits for whoever takes its messages."""
+        return {}
+
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration beforehand."""
         return {topic: [decoder] for topic, decoder in self._watched.items()}
