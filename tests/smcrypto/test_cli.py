@@ -346,6 +346,18 @@ def test_sec1_keys_are_written_and_read(folder: Path, openssl: Callable[..., byt
     assert openssl("pkey", "-in", "key.pem", "-pubout") == Path("pub.pem").read_bytes()
 
 
+@pytest.mark.parametrize("command, path", [
+    (["keygen", "-o", "key.pem"], "key.pem"),
+    (["ca", "init", "--dir", "fleet", "--subject", "CN=x"], "fleet/ca.key.pem"),
+])  # fmt: skip
+def test_openssl_reads_our_encrypted_keys_where_it_is_asked_for(
+    folder: Path, command: list[str], path: str, openssl: Callable[..., bytes]
+) -> None:
+    assert main([*command, "--password-file", "password", "--prf", "sha256"]) == 0
+    assert main(["pubkey", "--key", path, "--password-file", "password", "-o", "pub.pem"]) == 0
+    assert openssl("pkey", "-in", path, "-passin", "file:password", "-pubout") == Path("pub.pem").read_bytes()
+
+
 @pytest.mark.parametrize("cipher", ["-aes-256-cbc", "-sm4-cbc"])
 def test_an_encrypted_key_of_openssl_opens_with_its_password(
     folder: Path, cipher: str, openssl: Callable[..., bytes]

@@ -15,7 +15,7 @@ from pathlib import Path
 from smcrypto import pem, sm2, x509
 from smcrypto.cli import passwords
 from smcrypto.cli.files import add_input, add_output, read_all, require_absent, write_output, write_private
-from smcrypto.cli.keys import add_key, add_uid, load_private, uid_bytes
+from smcrypto.cli.keys import add_key, add_prf, add_uid, load_private, uid_bytes
 from smcrypto.errors import CertificateError, InvalidOption
 
 __all__ = ["add_parser"]
@@ -53,6 +53,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_days(init, 3650)
     init.add_argument("--path-length", type=int, metavar="N", help="at most N intermediate CAs below (default: any)")
     init.add_argument("--unencrypted", action="store_true", help="write the CA's key without a password")
+    add_prf(init)
     init.add_argument("--force", action="store_true", help="overwrite an existing CA")
     add_uid(init)
     passwords.add_arguments(init)
@@ -154,7 +155,7 @@ def run_init(options: argparse.Namespace) -> int:
     if not options.unencrypted:
         password = passwords.read_password(options, "New password for the CA's key", confirm=True)
     options.dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_private(key_file, key.to_pem(password=password), force=options.force)
+    write_private(key_file, key.to_pem(password=password, prf=options.prf), force=options.force)
     write_output(certificate_file, [certificate.to_pem()])
     print(f"{certificate_file}: {certificate.subject}, SM3 fingerprint {certificate.fingerprint().hex()}",
           file=sys.stderr)

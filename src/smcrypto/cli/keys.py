@@ -10,7 +10,7 @@ from smcrypto import sm2
 from smcrypto.cli import passwords
 from smcrypto.cli.files import add_output, require_absent, write_output, write_private
 
-__all__ = ["add_key", "add_parser", "add_public", "add_uid", "load_private", "load_public", "uid_bytes"]
+__all__ = ["add_key", "add_parser", "add_prf", "add_public", "add_uid", "load_private", "load_public", "uid_bytes"]
 
 _ENCRYPTED = b"ENCRYPTED PRIVATE KEY"
 
@@ -24,6 +24,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     keygen.add_argument("--format", choices=("pkcs8", "sec1"), default="pkcs8", help="default: %(default)s")
     keygen.add_argument("--encrypt", action="store_true",
                         help="encrypt the private key under a password, asked for unless an option names it")
+    add_prf(keygen)
     keygen.add_argument("--force", action="store_true", help="overwrite an existing private key")
     passwords.add_arguments(keygen)
     keygen.set_defaults(run=run_keygen)
@@ -38,6 +39,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def add_key(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="private key (PEM)")
     passwords.add_arguments(parser)
+
+
+def add_prf(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--prf", choices=("sm3", "sha256"), default="sm3",
+                        help="hash that makes a key of the password; OpenSSL 3.0 reads sha256 (default: %(default)s)")
 
 
 def add_public(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +76,8 @@ def run_keygen(options: argparse.Namespace) -> int:
     wanted = options.encrypt or passwords.named(options)
     password = passwords.read_password(options, "New password", confirm=True) if wanted else None
     key = sm2.PrivateKey.generate()
-    write_private(options.output, key.to_pem(password=password, format=options.format), force=options.force)
+    written = key.to_pem(password=password, format=options.format, prf=options.prf)
+    write_private(options.output, written, force=options.force)
     if options.public is not None:
         write_output(options.public, [key.public_key.to_pem()])
     return 0
