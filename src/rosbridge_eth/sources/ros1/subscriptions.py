@@ -299,7 +299,8 @@ class Subscriptions:
                 room -= 1
                 topic.connections[uri] = _Connection(retry_at=now)
             else:
-                self._say("room", f"more than {MAX_CONNECTIONS} publishers; those of {call.topic} are left out")
+                self._say("room", f"more than {MAX_CONNECTIONS} publishers; some of {call.topic} are left out")
+                break
 
     def _judge_registrations(self, subscribers: dict[str, list[str]], now: float) -> None:
         """Register again what the master does not know."""

@@ -104,15 +104,20 @@ class Graph:
 
 
 class Listening:
-    """A source that runs in a thread; every message goes through Capture, as in a robot."""
+    """A source that runs in a thread; every message goes through Capture, as in a robot.
 
-    def __init__(self, uri: str, topics: Sequence[str] = (), nodes: Sequence[str] = (), **settings: object) -> None:
+    tolerant: a message that cannot be captured is no failure.
+    """
+
+    def __init__(self, uri: str, topics: Sequence[str] = (), nodes: Sequence[str] = (), *,
+                 tolerant: bool = False, **settings: object) -> None:
         chosen = replace(Ros1Settings(master=uri, hostname="127.0.0.1"), **settings)  # type: ignore[arg-type]
         self.source = Ros1Source(chosen, Selection(topics, nodes))
         self.capture = Capture([TopicRule("**", fields=("*",), limit=4096)])
         self.raw: list[RawMessage] = []
         self.data: dict[str, list] = {}
         self.stop = threading.Event()
+        self._tolerant = tolerant
         self.failure: list[BaseException] = []
         self.before_taking: Callable[[], object] = lambda: None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -138,7 +143,9 @@ class Listening:
         self.before_taking()
         self.raw.append(raw)
         record = self.capture.process(raw, time.time_ns(), time.monotonic_ns())
-        assert record is not None
+        if record is None:
+            assert self._tolerant, f"{raw.topic} cannot be captured"
+            return
         self.data.setdefault(raw.topic, []).append(record.data)
 
     def count(self, topic: str) -> int:
