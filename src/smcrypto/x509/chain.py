@@ -90,7 +90,10 @@ def verify_chain(
 def _names(names: str | Iterable[str] | None) -> tuple[str, ...]:
     if names is None:
         return ()
-    return (names,) if isinstance(names, str) else tuple(names)
+    listed = (names,) if isinstance(names, str) else tuple(names)
+    for name in listed:
+        require_type(name, str, "each usage")
+    return listed
 
 
 class _GivenUp(CertificateError):

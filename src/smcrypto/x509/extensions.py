@@ -14,7 +14,7 @@ from typing import Final
 
 from smcrypto import der, sm3
 from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
-from smcrypto.inputs import require_int
+from smcrypto.inputs import as_bytes, require_int, require_type
 from smcrypto.x509.names import Name
 
 __all__ = [
@@ -72,6 +72,11 @@ class Extension:
     oid: str
     critical: bool
     value: bytes
+
+    def __post_init__(self) -> None:
+        require_type(self.oid, str, "oid")
+        require_type(self.critical, bool, "critical")
+        object.__setattr__(self, "value", as_bytes(self.value, "value"))
 
     def to_der(self) -> bytes:
         """Extension ::= SEQUENCE { extnID, critical, extnValue } (RFC 5280, 4.1)."""
@@ -140,6 +145,7 @@ def read_basic_constraints(value: bytes) -> BasicConstraints:
 
 
 def basic_constraints(ca: bool, path_length: int | None) -> Extension:
+    require_type(ca, bool, "ca")
     if path_length is not None and (require_int(path_length, "path_length") < 0 or not ca):
         raise InvalidOption("a path length is a number from 0 on, and for a CA only")
     parts = ([der.boolean(True)] if ca else []) + ([] if path_length is None else [der.integer(path_length)])
@@ -331,4 +337,7 @@ def requested(
 def _listed(names: Iterable[str]) -> tuple[str, ...]:
     if isinstance(names, str):
         raise TypeError(f"a collection of names is needed, not the one str {names!r}")
-    return tuple(names)
+    listed = tuple(names)
+    for name in listed:
+        require_type(name, str, "each name")
+    return listed

@@ -145,7 +145,9 @@ def _certificate(
     all_extensions = [basic, *wanted, ext.subject_key_identifier(ext.key_identifier(public_key.to_bytes()))]
     if authority is not None:
         all_extensions.append(ext.authority_key_identifier(authority))
-    all_extensions += further
+    for extension in further:
+        require_type(extension, ext.Extension, "each of extensions")
+        all_extensions.append(extension)
     kinds = [e.oid for e in all_extensions]
     if len(set(kinds)) != len(kinds):
         raise InvalidOption("an extension is given twice")

@@ -111,7 +111,7 @@ class Name:
         if isinstance(subject, str):
             return cls.from_rfc4514(subject)
         pairs = subject.items() if isinstance(subject, Mapping) else subject
-        return cls([(_attribute(kind, text),) for kind, text in pairs])
+        return cls([(_attribute(*_pair(pair)),) for pair in pairs])
 
     @classmethod
     def from_rfc4514(cls, text: str) -> Name:
@@ -212,6 +212,12 @@ def _read_attribute(reader: der.Reader) -> Attribute:
         except UnicodeDecodeError:
             raise CertificateError(f"a name's {_BY_OID.get(oid, oid)} is not {codec} text") from None
     return Attribute(oid, value, text)
+
+
+def _pair(pair: tuple[str, str]) -> tuple[str, str]:
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise TypeError(f"a name is made of pairs of type and value, not of {pair!r}")
+    return pair[0], pair[1]
 
 
 def _attribute(kind: str, text: str) -> Attribute:

@@ -91,9 +91,12 @@ def sign(body: bytes, key: sm2.PrivateKey, uid: bytes) -> bytes:
 
 
 def instant(value: datetime, name: str) -> datetime:
-    """`value` in UTC; TypeError if it is no datetime, InvalidOption if it does not say its time zone."""
+    """`value` in UTC; TypeError if it is no datetime, InvalidOption if it names no moment of the years 1 to 9999."""
     if not isinstance(value, datetime):
         raise TypeError(f"{name} must be a datetime, not {type(value).__name__}")
     if value.utcoffset() is None:
         raise InvalidOption(f"{name} must be an aware datetime, such as datetime.now(UTC)")
-    return value.astimezone(UTC)
+    try:
+        return value.astimezone(UTC)
+    except OverflowError:
+        raise InvalidOption(f"{name} is not within the years 1 to 9999 of UTC") from None

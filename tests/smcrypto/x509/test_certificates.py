@@ -254,11 +254,16 @@ def test_the_ca_key_must_be_that_of_the_ca_certificate() -> None:
         x509.issue(CSR, ROOT.certificate, KEY, **TIMES)
 
 
+EAST, WEST = timezone(timedelta(hours=8)), timezone(timedelta(hours=-5))
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
         ({"not_before": NOW.replace(tzinfo=None)}, "not_before must be an aware datetime"),
         ({"not_after": NOW.replace(tzinfo=None)}, "not_after must be an aware datetime"),
+        ({"not_before": datetime(1, 1, 1, tzinfo=EAST)}, "not_before is not within the years 1 to 9999 of UTC"),
+        ({"not_after": datetime(9999, 12, 31, 23, tzinfo=WEST)}, "not_after is not within the years"),
         ({"not_after": BEGIN - timedelta(seconds=1)}, "not_after lies before not_before"),
         ({"serial_number": 0}, "serial_number"),
         ({"serial_number": -1}, "serial_number"),
@@ -290,11 +295,26 @@ def test_issuing_refuses(options: dict[str, Any], reason: str) -> None:
         {"not_before": "2026-01-01"}, {"not_after": 0}, {"serial_number": True}, {"serial_number": "1"},
         {"path_length": True, "ca": True}, {"path_length": "1", "ca": True}, {"key_usage": "digitalSignature"},
         {"extended_key_usage": "serverAuth"}, {"subject_alt_names": "DNS:a"}, {"uid": "1234567812345678"},
+        {"key_usage": [0]}, {"extended_key_usage": [5]}, {"subject_alt_names": [None]},
+        {"subject_alt_names": [b"DNS:a"]}, {"ca": "no"}, {"ca": 1}, {"ca": None}, {"extensions": [b"\x05\x00"]}, {"extensions": 5},
     ],
 )  # fmt: skip
 def test_issuing_takes_no_other_types(options: dict[str, Any]) -> None:
     with pytest.raises(TypeError):
         issue(**options)
+
+
+@pytest.mark.parametrize("arguments", [(5, True, b""), (b"1.2.3", True, b""), ("1.2.3", 1, b""), ("1.2.3", True, "")])
+def test_an_extension_takes_no_other_types(arguments: Any) -> None:
+    with pytest.raises(TypeError):
+        Extension(*arguments)
+
+
+def test_an_extension_keeps_its_own_copy() -> None:
+    value = bytearray(b"\x05\x00")
+    extension = Extension("1.2.3", False, value)
+    value[0] = 0
+    assert extension.value == b"\x05\x00"
 
 
 def test_arguments_must_be_what_they_are_called() -> None:
@@ -328,9 +348,8 @@ def test_the_ca_may_choose_another_subject() -> None:
 
 
 def test_times_of_any_zone_are_written_in_utc() -> None:
-    east = timezone(timedelta(hours=8))
     c = issue(
-        not_before=datetime(2026, 1, 1, 8, tzinfo=east), not_after=datetime(2055, 1, 1, 0, 0, 0, 999999, tzinfo=UTC)
+        not_before=datetime(2026, 1, 1, 8, tzinfo=EAST), not_after=datetime(2055, 1, 1, 0, 0, 0, 999999, tzinfo=UTC)
     )
     assert c.not_before == datetime(2026, 1, 1, tzinfo=UTC)
     assert c.not_after == datetime(2055, 1, 1, tzinfo=UTC)

@@ -476,6 +476,9 @@ def test_arguments_of_the_wrong_type() -> None:
             x509.verify_chain(leaf, intermediates=intermediates, roots=roots, at=NOW)
     with pytest.raises(TypeError):
         verify(LEAF, SUB, uid="1234567812345678")
+    for purposes in ({"extended_key_usage": [5]}, {"key_usage": [b"digitalSignature"]}, {"key_usage": 5}):
+        with pytest.raises(TypeError):
+            verify(LEAF, SUB, **purposes)
 
 
 def test_unknown_options() -> None:

@@ -168,7 +168,7 @@ def test_names_that_cannot_be_written(subject: dict[str, str]) -> None:
         Name.build(subject)
 
 
-@pytest.mark.parametrize("subject", [{"CN": 1}, {1: "x"}, {"CN": b"x"}])
+@pytest.mark.parametrize("subject", [{"CN": 1}, {1: "x"}, {"CN": b"x"}, [("CN",)], [("CN", "x", "y")], ["CN"], [5], 5])
 def test_names_are_text(subject: Any) -> None:
     with pytest.raises(TypeError):
         Name.build(subject)
