@@ -20,8 +20,9 @@ from smcrypto.inputs import BytesLike, as_bytes
 
 __all__ = ["Block", "decode", "encode", "first"]
 
-# RFC 7468, 3: label characters are printable but "-", single "-" and spaces between them.
-_BOUNDARY: Final = re.compile(rb"-----(BEGIN|END) ([!-,.-~]+(?:[ -][!-,.-~]+)*)-----[ \t]*")
+# RFC 7468, 3: label characters are printable but "-", single "-" and spaces between them. Possessive, so that a
+# line which is no boundary is given up at once, without a memory of every place where it could have been cut.
+_BOUNDARY: Final = re.compile(rb"-----(BEGIN|END) ([!-,.-~]++(?:[ -][!-,.-~]++)*+)-----[ \t]*")
 _LINE_END: Final = re.compile(rb"\r\n|\n|\r")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ssl
+import tracemalloc
 
 import pytest
 from hypothesis import given
@@ -64,6 +65,18 @@ def test_several_blocks_keep_their_order() -> None:
 def test_a_malformed_block_is_refused(data: bytes) -> None:
     with pytest.raises(InvalidEncoding):
         pem.decode(data)
+
+
+def test_a_line_that_is_nearly_a_boundary_costs_no_memory() -> None:
+    line = b"-----BEGIN " + b"A " * 100_000 + b"-----\n"
+    pem.decode(BLOCK)
+    tracemalloc.start()
+    try:
+        assert pem.decode(line + BLOCK) == pem.decode(BLOCK)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 5 * len(line)
 
 
 def test_no_block_of_the_label() -> None:
