@@ -401,14 +401,21 @@ def _cbc_decrypt(algorithm: str, key: bytes, iv: bytes, ciphertext: bytes) -> by
 def _foreign_cbc_decrypt(algorithm: str, key: bytes, iv: bytes, ciphertext: bytes) -> bytes:
     """AES or 3DES, which this library does not contain, by the `cryptography` package."""
     try:
-        from cryptography.hazmat.decrepit.ciphers.algorithms import TripleDES
-        from cryptography.hazmat.primitives.ciphers import Cipher, modes
-        from cryptography.hazmat.primitives.ciphers.algorithms import AES
+        from cryptography.hazmat.primitives.ciphers import Cipher, CipherAlgorithm, modes
+
+        cipher: CipherAlgorithm
+        if algorithm == "AES":
+            from cryptography.hazmat.primitives.ciphers.algorithms import AES
+
+            cipher = AES(key)
+        else:  # by this name since version 43: an older one still reads AES
+            from cryptography.hazmat.decrepit.ciphers.algorithms import TripleDES
+
+            cipher = TripleDES(key)
     except ImportError:
         raise MissingDependency(
             f"the private key is encrypted with {algorithm}; reading it needs the package 'cryptography'"
         ) from None
-    cipher = AES(key) if algorithm == "AES" else TripleDES(key)
     decryptor = Cipher(cipher, modes.CBC(iv)).decryptor()
     return bytes(decryptor.update(ciphertext) + decryptor.finalize())
 

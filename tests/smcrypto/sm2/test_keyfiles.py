@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import hashlib
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -566,6 +567,19 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     data = encrypted(cipher_oid="2.16.840.1.101.3.4.1.42", ciphertext=bytes(16))
     with pytest.raises(MissingDependency, match="encrypted with AES; reading it needs the package 'cryptography'"):
         sm2.PrivateKey.from_der(data, b"pw")
+
+
+def test_aes_is_read_where_the_package_is_too_old_for_triple_des(monkeypatch: pytest.MonkeyPatch) -> None:
+    ciphers = pytest.importorskip("cryptography.hazmat.primitives.ciphers")
+    key = hashlib.pbkdf2_hmac("sha256", b"pw", b"salt", 1, 32)
+    padded = KEY.to_der() + bytes([16 - len(KEY.to_der()) % 16]) * (16 - len(KEY.to_der()) % 16)
+    encryptor = ciphers.Cipher(ciphers.algorithms.AES(key), ciphers.modes.CBC(bytes(16))).encryptor()
+    data = encrypted(cipher_oid="2.16.840.1.101.3.4.1.42", ciphertext=encryptor.update(padded))
+    monkeypatch.setitem(sys.modules, "cryptography.hazmat.decrepit.ciphers.algorithms", None)
+    assert sm2.PrivateKey.from_der(data, b"pw") == KEY
+    triple = encrypted(cipher_oid="1.2.840.113549.3.7", iv=bytes(8), ciphertext=bytes(16))
+    with pytest.raises(MissingDependency, match="encrypted with TripleDES"):
+        sm2.PrivateKey.from_der(triple, b"pw")
 
 
 # --- fuzzing: any bytes are a key or an SMCryptoError, and a key has few encodings ---
