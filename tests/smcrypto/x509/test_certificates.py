@@ -296,7 +296,8 @@ def test_issuing_refuses(options: dict[str, Any], reason: str) -> None:
         {"path_length": True, "ca": True}, {"path_length": "1", "ca": True}, {"key_usage": "digitalSignature"},
         {"extended_key_usage": "serverAuth"}, {"subject_alt_names": "DNS:a"}, {"uid": "1234567812345678"},
         {"key_usage": [0]}, {"extended_key_usage": [5]}, {"subject_alt_names": [None]},
-        {"subject_alt_names": [b"DNS:a"]}, {"ca": "no"}, {"ca": 1}, {"ca": None}, {"extensions": [b"\x05\x00"]}, {"extensions": 5},
+        {"subject_alt_names": [b"DNS:a"]}, {"ca": "no"}, {"ca": 1}, {"ca": None},
+        {"extensions": [b"\x05\x00"]}, {"extensions": 5},
     ],
 )  # fmt: skip
 def test_issuing_takes_no_other_types(options: dict[str, Any]) -> None:
