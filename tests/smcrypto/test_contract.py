@@ -13,7 +13,7 @@ import inspect
 import pickle
 from array import array
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 from typing import Any, NamedTuple
 
 import pytest
@@ -294,6 +294,8 @@ def right_confirmation() -> bytes:
 EPHEMERAL = sm2.PrivateKey.from_int(88).public_key.to_bytes()
 VALID = {"not_before": NOW, "not_after": NOW + timedelta(days=1)}
 GCM, CCM = sm4.SM4GCM(KEY16), sm4.SM4CCM(KEY16)
+EAST = timezone(timedelta(hours=14))
+LATEST = datetime.max.replace(tzinfo=timezone(timedelta(hours=-12)))
 LOCKED = {"pem": key.to_pem(b"password"), "der": key.to_der(b"password")}
 
 ENTRIES = [
@@ -434,6 +436,7 @@ WRONG_TYPES = [
      [b"", 5, public]),
     ("request key", lambda v: x509.CertificateSigningRequest.create(v, subject={}), [b"", 5, None, public]),
     ("self_signed key", lambda v: x509.self_signed(v, subject={"CN": "x"}, **VALID), [b"", 5, None, public]),
+    ("subject", x509.Name.build, [5, None, [5], ["CN=x"], [("CN",)], {"CN": b"x"}, {5: "x"}]),
     ("issue csr", lambda v: x509.issue(v, root, root_key, **VALID), [b"", None, leaf]),
     ("issue ca_certificate", lambda v: x509.issue(csr, v, root_key, **VALID), [b"", None, csr]),
     ("issue ca_key", lambda v: x509.issue(csr, root, v, **VALID), [b"", 5, None, public]),
@@ -538,6 +541,9 @@ REFUSED = [
     (smcrypto.InvalidOption, lambda: key.to_der(password=b"p", format="sec1")),
     (smcrypto.InvalidOption, lambda: kdf.pbkdf2_hmac(b"p", b"s", 0, 16)),
     (smcrypto.InvalidOption, lambda: x509.verify_chain(leaf, roots=[root], at=NOW.replace(tzinfo=None))),
+    (smcrypto.InvalidOption, lambda: x509.verify_chain(leaf, roots=[root], at=datetime.min.replace(tzinfo=EAST))),
+    (smcrypto.InvalidOption, lambda: x509.self_signed(key, subject={"CN": "x"}, not_before=NOW, not_after=LATEST)),
+    (smcrypto.InvalidOption, lambda: x509.self_signed(key, subject={"CN": "x"}, not_before=LATEST, not_after=NOW)),
     # what the peer sent
     *((smcrypto.InvalidSignature, lambda s=s, e=e: public.verify(s, b"m", encoding=e))
       for s in (b"", b"0", bytes(64), bytes(72), b"\xff" * 64) for e in ("der", "raw")),
