@@ -119,7 +119,7 @@ class Listening:
         self.stop = threading.Event()
         self._tolerant = tolerant
         self.failure: list[BaseException] = []
-        self.before_taking: Callable[[], object] = lambda: None
+        self.take: Callable[[RawMessage], object] = self.keep
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Listening:
@@ -140,7 +140,9 @@ class Listening:
             self.failure.append(error)
 
     def _emit(self, raw: RawMessage) -> None:
-        self.before_taking()
+        self.take(raw)
+
+    def keep(self, raw: RawMessage) -> None:
         self.raw.append(raw)
         record = self.capture.process(raw, time.time_ns(), time.monotonic_ns())
         if record is None:

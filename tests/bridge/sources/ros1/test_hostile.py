@@ -203,7 +203,7 @@ def test_memory_is_bounded(master, name):
     master.publishers.pop("/good")
     gate = threading.Event()
     listening = Listening(master.uri, ["/t"], max_message=largest, tolerant=True)
-    listening.before_taking = lambda: gate.wait(20)
+    listening.take = lambda raw: (gate.wait(20), listening.keep(raw))
     tracemalloc.start()
     try:
         with closing_all(*hostile), listening:

@@ -5,13 +5,21 @@ from __future__ import annotations
 import threading
 import time
 import xmlrpc.client
+from functools import partial
 
 import pytest
 
 from bridge.sources.ros1.graph import Graph, Listening, eventually
+from rosbridge_eth.capture import Capture, CapturedRecord, RawMessage, TopicRule
 from rosbridge_eth.errors import SourceError
+from rosbridge_eth.identity import sign, verify
+from rosbridge_eth.records import robot_id
+from rosbridge_eth.robot.recorder import Recorder
+from rosbridge_eth.sealing import Kind, Opener, Sealer, read_opening
 from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, sample_bag
 from rosbridge_eth.sources.ros1 import Cause, Ros1Settings, Ros1Source
+from rosbridge_eth.store import Spool
+from smcrypto import sm2
 
 pytestmark = pytest.mark.service
 
@@ -256,7 +264,7 @@ def test_ros_tools_see_a_node_in_good_order(graph):
 def test_messages_are_dropped_and_counted_while_nobody_takes_them(graph):
     listening = Listening(graph.uri, ["/flood"], waiting=16)
     take = threading.Event()
-    listening.before_taking = take.wait
+    listening.take = lambda raw: (take.wait(), listening.keep(raw))
     with listening:
         graph.publish("flood", {"topic": "/flood", "kind": "number", "count": 200})
         eventually(lambda: listening.source.statistics().get("/flood") is not None
@@ -267,3 +275,36 @@ def test_messages_are_dropped_and_counted_while_nobody_takes_them(graph):
     assert numbers == [0, *range(184, 200)]  # one was being emitted; of the rest the newest are kept
     assert listening.source.statistics()["/flood"].dropped == 183
     assert listening.source.dropped == {"/flood": 183}
+
+
+def test_what_a_robot_publishes_is_sealed_and_spooled(graph, tmp_path):
+    """rospy to the records that leave the robot: the Recorder as a robot runs it, and a reader who opens them."""
+    robot_key, reader = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
+    robot = robot_id("robot_1")
+    with Spool(tmp_path / "spool.sqlite", robot) as spool:
+        sealer = Sealer(robot, partial(sign, robot_key), [reader.public_key])
+        recorder = Recorder(Capture([TopicRule("/sealed/**")]), sealer, spool)
+
+        def take(raw: RawMessage) -> None:
+            recorder.take(raw, wall_ns=time.time_ns(), mono_ns=time.monotonic_ns(), now=time.monotonic())
+
+        listening = Listening(graph.uri, ["/sealed/**"])
+        listening.take = take
+        with listening:
+            graph.publish(
+                "sealed",
+                {"topic": "/sealed/odom", "kind": "odometry", "count": 40, "rate": 50},
+                {"topic": "/sealed/report", "kind": "report", "count": 5, "rate": 10},
+            )
+            eventually(lambda: recorder.times.records == 45, "45 records")
+        recorder.finish(wall_ns=time.time_ns(), now=time.monotonic())
+        opening, *records, end = spool.pending(100, 1 << 22)
+    verified = partial(verify, robot_key.public_key)
+    stream = Opener(reader).grant(read_opening(opening, verified))
+    assert stream.open(end, verified).kind is Kind.END
+    found = [CapturedRecord.from_json(stream.open(record, verified).payload) for record in records]
+    odometry = [record for record in found if record.topic == "/sealed/odom"]
+    assert [record.data["pose"]["pose"]["position"]["x"] for record in odometry] == [n / 8 for n in range(40)]
+    assert all(0 < record.wall_ns - record.received_ns < 10**10 for record in found)
+    reports = [record.data for record in found if record.topic == "/sealed/report"]
+    assert [len(report["readings"]) for report in reports] == [0, 1, 2, 3, 4]

@@ -1,0 +1,52 @@
+"""[source] kind = "ros1" in robot.toml."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rosbridge_eth.config import RobotConfig, parse_config
+from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.sources import open_source
+from rosbridge_eth.sources.ros1 import Ros1Settings, Ros1Source
+
+
+def source(text: str) -> Ros1Settings:
+    config = parse_config(RobotConfig, f'topics = ["/a"]\n[source]\nkind = "ros1"\n{text}', Path("robot.toml"))
+    return config.source.settings()
+
+
+def test_nothing_more_need_be_said():
+    assert source("") == Ros1Settings()
+    opened = open_source(source(""), parse_config(RobotConfig, 'topics = ["/a"]', Path("robot.toml")).selection())
+    assert isinstance(opened, Ros1Source)
+
+
+def test_every_key_arrives():
+    text = """
+        master = "http://192.0.2.7:11311"
+        hostname = "192.0.2.8"
+        node = "fleet/recorder"
+        max_message = "1 MiB"
+        waiting = 100
+        timeout = "2s"
+    """
+    assert source(text) == Ros1Settings("http://192.0.2.7:11311", "192.0.2.8", "/fleet/recorder", 2**20, 100, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        ('master = "robot:11311"', "source.master is 'robot:11311'; write the master's URI, such as"),
+        ('hostname = "robot:5"', "source.hostname is 'robot:5'; write a name or an address, without a port"),
+        ('node = "a b"', "source.node is 'a b'; a node's name has letters, digits"),
+        ('max_message = "65 MiB"', "source.max_message"),
+        ("waiting = 1", "source.waiting is 1; it should be at least 16"),
+        ('mastr = "http://robot:11311"', "unknown key 'mastr' in source; did you mean 'master'?"),
+    ],
+)
+def test_mistakes_are_told(line, why):
+    with pytest.raises(ConfigError) as error:
+        source(line)
+    assert why in str(error.value)
