@@ -214,12 +214,12 @@ class ServerConfig(ChannelConfig):
     """This process's number among those that share the port (0 to 255): first byte of its connection ids."""
     cookie_lifetime: float = 20.0
     half_open_timeout: float = 10.0
-    max_half_open: int = 256
+    max_half_open: int = 1024
     max_connections: int = 4096
     max_total_bytes: int = 64 << 20
     """Messages without an answer, parts of messages and answers without an acknowledgement, all connections."""
     source_rate: float = 10.0
-    source_burst: float = 100.0
+    source_burst: float = 400.0
     """Handshakes that one source may fail per second, and at once."""
     max_sources: int = 4096
     handshake_share: float = 0.5

@@ -508,10 +508,10 @@ class LimitsConfig(Section):
     """Bounds on what strangers and robots can make the server do; per worker process."""
 
     connections: int = Field(default=4096, ge=1, description="Sessions.")
-    half_open: int = Field(default=256, ge=1, description="Handshakes that are under way.")
+    half_open: int = Field(default=1024, ge=1, description="Handshakes that are under way.")
     handshake_share: float = Field(default=0.5, gt=0, le=1, description="Share of time that handshakes may take.")
     source_rate: float = Field(default=10.0, gt=0, description="Handshakes per second that one address may fail.")
-    source_burst: float = Field(default=100.0, ge=1, description="And at once.")
+    source_burst: float = Field(default=400.0, ge=1, description="And at once.")
     unanswered: int = Field(default=256, ge=1, description="Messages of one session that wait for their answer.")
     memory: Size = Field(default=64 * MIB, ge=MIB, description="Bytes of messages under way, all sessions together.")
 
