@@ -81,6 +81,9 @@ class Program:
                 )
                 self._changed.wait(min(left, 0.5))
 
+    def says(self, text: str) -> None:
+        self.until(lambda: any(text in line for line in self.errors), f"saying {text!r}")
+
     def finish(self, number: int | None = None) -> int:
         if number is not None and self.process.poll() is None:
             self.process.send_signal(number)
@@ -144,9 +147,6 @@ class Watcher(Program):
     def watches(self, topic: str) -> None:
         self.until(lambda: any(f"{topic}: watched" in line for line in self.errors), f"watching {topic}")
 
-    def says(self, text: str) -> None:
-        self.until(lambda: any(text in line for line in self.errors), f"saying {text!r}")
-
     def recorded(self, count: int) -> list[dict[str, Any]]:
         self.until(lambda: len(self.records) >= count, f"the record {count}")
         return self.records
@@ -193,6 +193,12 @@ class Graph:
         self._keep(watcher)
         watcher.opened()
         return watcher
+
+    def program(self, arguments: list[str], **environment: str) -> Program:
+        """Any program of that Python."""
+        program = Program([self._python, *arguments], {**self.environment, **environment})
+        self._keep(program)
+        return program
 
     def run(self, script: str) -> str:
         """The output of a program of the same Python."""

@@ -1,4 +1,4 @@
-"""What holds of the ros2 source where no ROS is installed: the error that tells how to get it, the choice of quality."""
+"""What holds where no ROS is installed: the error that tells how to get it, the choice of quality."""
 
 from __future__ import annotations
 
