@@ -16,7 +16,7 @@ import selectors
 import socket
 import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -29,6 +29,10 @@ MAX_INCOMING = 64
 """Connections to our listener at once; the oldest goes when one more comes."""
 RESOLVERS = 4
 """Threads that ask the name server."""
+REFRESH = 10.0
+"""Seconds after which a name that is used is asked again."""
+MAX_KNOWN = 256
+"""Names whose addresses are remembered; the one used least recently goes."""
 SCAN_EVERY = 0.05
 """Seconds between looks at the deadlines."""
 LONGEST_TURN = 0.1
@@ -75,7 +79,7 @@ class Connection:
         if isinstance(addresses, str):
             self.end(addresses)
             return
-        self._addresses = addresses
+        self._addresses = list(addresses)
         self._dial("the name has no address")
 
     def _dial(self, why: str) -> None:
@@ -252,50 +256,74 @@ class Loop:
 
 
 class _Resolver:
-    """getaddrinfo in a few threads, which begin with the first name that is not an address."""
+    """getaddrinfo in a few threads, which begin with the first name that is not an address.
+
+    A name that resolved before is answered at once and asked again later, so that names which
+    hang (anybody may list one at the master) do not stand in the way of the master's own.
+    """
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
-        self._asked: queue.SimpleQueue[tuple[str, int, Connection] | None] = queue.SimpleQueue()
-        self._found: deque[tuple[Connection, Addresses | str]] = deque()
+        self._asked: queue.SimpleQueue[tuple[str, int, Connection | None] | None] = queue.SimpleQueue()
+        self._found: deque[tuple[str, Connection | None, Addresses | str]] = deque()  # by the threads
+        self._known: OrderedDict[str, tuple[float, Addresses]] = OrderedDict()  # by name, and when it was asked
         self._threads: list[threading.Thread] = []
 
     def ask(self, host: str, port: int, connection: Connection) -> None:
         try:
             address = ipaddress.ip_address(host)
         except ValueError:
-            if len(self._threads) < RESOLVERS:
-                # Daemons: a name server that never answers must not keep the process from ending.
-                self._threads.append(threading.Thread(target=self._work, name="resolver", daemon=True))
-                self._threads[-1].start()
-            self._asked.put((host, port, connection))
+            self._ask_name(host, port, connection)
             return
         family = socket.AF_INET if address.version == 4 else socket.AF_INET6
-        self._found.append((connection, [(family, (str(address), port))]))
+        self._found.append(("", connection, [(family, (str(address), port))]))
         self._wake()
 
     def found(self) -> list[tuple[Connection, Addresses | str]]:
+        """What was found since the last call."""
         found = []
         while self._found:
-            found.append(self._found.popleft())
+            host, connection, answer = self._found.popleft()
+            if host and not isinstance(answer, str):
+                self._known[host] = (time.monotonic(), answer)
+                while len(self._known) > MAX_KNOWN:
+                    self._known.popitem(last=False)
+            if connection is not None:
+                found.append((connection, answer))
         return found
 
     def close(self) -> None:
         for _ in self._threads:
             self._asked.put(None)
 
+    def _ask_name(self, host: str, port: int, connection: Connection) -> None:
+        now = time.monotonic()
+        asked_at, addresses = self._known.get(host, (now, None))
+        if addresses is not None:
+            self._known.move_to_end(host)
+            self._found.append(("", connection, [(family, (a[0], port, *a[2:])) for family, a in addresses]))
+            self._wake()
+            if now - asked_at < REFRESH:
+                return
+            self._known[host] = (now, addresses)
+        if len(self._threads) < RESOLVERS:
+            # Daemons: a name server that never answers must not keep the process from ending.
+            self._threads.append(threading.Thread(target=self._work, name="resolver", daemon=True))
+            self._threads[-1].start()
+        self._asked.put((host, port, None if addresses is not None else connection))
+
     def _work(self) -> None:
         while (question := self._asked.get()) is not None:
             host, port, connection = question
-            if not connection._open:
+            if connection is not None and not connection._open:
                 continue
+            answer: Addresses | str
             try:
-                entries = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+                answer = [(entry[0], entry[4]) for entry in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
             except (OSError, UnicodeError) as error:
                 why = error.strerror if isinstance(error, OSError) and error.strerror else "it is malformed"
-                self._found.append((connection, f"the name {host} does not resolve ({why.lower()})"))
-            else:
-                self._found.append((connection, [(entry[0], entry[4]) for entry in entries]))
+                answer = f"the name {host} does not resolve ({why.lower()})"
+            self._found.append((host, connection, answer))
             self._wake()
 
 

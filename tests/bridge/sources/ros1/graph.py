@@ -161,5 +161,10 @@ class Listening:
         )
         return self.data.get(topic, [])
 
+    def ended(self, topic: str) -> int:
+        """Attempts to connect, and connections, that came to nothing."""
+        counters = self.source.statistics().get(topic)
+        return sum(counters.ended.values()) if counters else 0
+
     def numbers(self, topic: str) -> list[int]:
         return [data["data"] for data in self.data.get(topic, ())]
