@@ -2,7 +2,7 @@
 
 publishing.py NODE
 
-{"create": "/t", "type": "std_msgs/msg/String", "reliable": true, "latched": false, "depth": 10}
+{"create": "/t", "type": "std_msgs/msg/String", "reliable": true, "latched": false, "depth": 1000}
 {"publish": "/t", "fields": {"data": "x"}}
 {"burst": "/t", "count": 100, "rate": 100, "fields": {...}}   std_msgs/String and UInt32 get the number in `data`
 {"await": "/t", "count": 1}      until so many subscriptions are matched
@@ -61,7 +61,7 @@ for line in sys.stdin:
         package, kind, type_name = order["type"].split("/")
         types[order["create"]] = generated = getattr(import_module(f"{package}.{kind}"), type_name)
         profile = QoSProfile(
-            depth=order.get("depth", 10),
+            depth=order.get("depth", 1000),
             reliability=ReliabilityPolicy.RELIABLE if order.get("reliable", True) else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if order.get("latched") else DurabilityPolicy.VOLATILE,
         )
