@@ -59,6 +59,7 @@ OFFER_INTERVAL = 0.1  # s: an OFFER is repeated no faster, however often its PRO
 CHALLENGE_INTERVAL = 0.2  # s
 AMPLIFICATION = 3  # RFC 9000, 8: bytes sent to an address that is not proven, per byte received from it
 SHARE_BURST = 0.25  # s of handshake work that may come at once
+PATIENCE = 5.0  # s in line, after which a client is about to begin anew: to answer it would be work for nothing
 
 
 def cookie_key(identity: Identity) -> bytes:
@@ -265,9 +266,10 @@ class Server:
             key, oldest = next(iter(self._half_open.items()))
             if now < oldest.began + self.config.half_open_timeout:
                 break
-            oldest.state = advance(SERVER, oldest.state, ServerInput.EXPIRED)
             if oldest.waits:
-                self._counters.drop(Drop.BUSY)
+                self._give_up(key, oldest)
+                continue
+            oldest.state = advance(SERVER, oldest.state, ServerInput.EXPIRED)
             if oldest.connection is not None:
                 self._forget(oldest.connection)
             self._half_open.pop(key, None)
@@ -275,7 +277,11 @@ class Server:
             self._finished.popitem(last=False)
         while self._line and self._share.available(now) > 0:
             half_open, key, piece, body = self._line.popleft()
-            if half_open.state is ServerState.ASSEMBLING:
+            if half_open.state is not ServerState.ASSEMBLING:
+                continue
+            if now - half_open.began > PATIENCE:
+                self._give_up(key, half_open)
+            else:
                 half_open.waits = False
                 self._answer_proof(piece, body, key, half_open, now)
         while self._timers and self._timers[0][0] <= now:
@@ -365,6 +371,13 @@ class Server:
             self._line.append((half_open, key, piece, body))
             return
         self._answer_proof(piece, body, key, half_open, now)
+
+    def _give_up(self, key: tuple[Address, bytes], half_open: _HalfOpen) -> None:
+        """Its turn did not come in time. That is no failure of the source's."""
+        self._counters.drop(Drop.BUSY)
+        half_open.state = advance(SERVER, half_open.state, ServerInput.EXPIRED)
+        self._sources.give_back(key[0])
+        del self._half_open[key]
 
     def _answer_proof(
         self, piece: Piece, body: bytes, key: tuple[Address, bytes], half_open: _HalfOpen, now: float

@@ -419,6 +419,30 @@ def test_handshakes_take_their_share_of_time_and_no_more():
     assert 90 <= examined() <= 110  # ten seconds, half of them, at 50 ms, and the burst
     server.handle_timer(1100.0)
     assert dropped(server)[Drop.BUSY] == 300 - examined()  # forgotten in the line
+    assert server.statistics().half_open == 0
+
+
+def test_an_overloaded_server_does_no_work_for_clients_that_have_given_up_and_holds_it_against_nobody():
+    """Who stood in line for longer than a client's patience is not examined, and may come again at once."""
+    server, examined = busy_server(0.5, ServerConfig(handshake_share=0.5, source_rate=0.001, source_burst=20.0))
+    waiting = [Steps(server=server, client=make_client(1000.0, None, robot(f"robot_{n}"))) for n in range(20)]
+    for number, steps in enumerate(waiting):
+        source = (HERE[0], 1000 + number)
+        for data in steps.to_client(*steps.to_server(steps.hello, source=source)):
+            server.receive_datagram(data, source, 1000.0)
+        server.datagrams_to_send(1000.0)
+    answered_late = 0
+    while server.next_timer() is not None and server.next_timer() < 1008.0:
+        now, before = server.next_timer(), examined()
+        server.handle_timer(now)
+        answered_late += (examined() - before) * (now > 1000.0 + ClientConfig().attempt_timeout - 1)
+    assert answered_late == 0
+    assert 4 <= examined() < 8
+    assert dropped(server)[Drop.BUSY] == 20 - examined()
+    server.handle_timer(1020.0)
+    server.datagrams_to_send(1020.0)
+    late = Steps(server=server, now=1020.0)
+    assert late.until_offer()
 
 
 def test_handshakes_for_which_there_is_no_time_yet_stand_in_line_and_are_answered_in_order_unasked():
