@@ -145,7 +145,8 @@ def run_demo(
 ) -> DemoResult:
     """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
 
-    harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each of them.
+    harm: what the network between robot and server does to datagrams; nothing by default.
+    on_datagram: is shown each of them.
     """
     started = time.monotonic()
     stages = Stages()

@@ -71,7 +71,7 @@ class Registry:
         self._db.execute("COMMIT")
 
     def revision(self) -> tuple[int, int]:
-        """Another value after every change, whichever process made it; cheap, so that readers can keep what they read."""
+        """Another value after every change, whichever process made it; cheap, so readers can keep what they read."""
         (others,) = self._db.execute("PRAGMA data_version").fetchone()
         return int(others), self._db.total_changes
 

@@ -51,9 +51,9 @@ class World:
     """One robot and one server over one network, both of which can be started again."""
 
     def __init__(self, folder: Path, seed: int, faults: Faults, *, release: str = "stored",
-                 limits: InboxLimits = InboxLimits()) -> None:
+                 limits: InboxLimits | None = None) -> None:
         self.network = Network(seed, faults)
-        self.folder, self.release, self.limits = folder, release, limits
+        self.folder, self.release, self.limits = folder, release, limits or InboxLimits()
         self.states: dict[RecordId, str] = {}
         self.registration = Registration(True, "0xA", "0xC", 1, 1)
         self.arrived: list[MessageReceived] = []

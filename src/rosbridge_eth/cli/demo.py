@@ -51,8 +51,8 @@ def demo(
                 progress.update(bar, completed=getattr(stages, name))
 
         result = run_demo(
-            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2), on_stage=lambda text: progress.console.print(f"· {text}"),
-            on_progress=show,
+            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
+            on_stage=lambda text: progress.console.print(f"· {text}"), on_progress=show,
         )
     stages = result.stages
     report.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,8 @@ def demo(
     )
     if json:
         print_json({
-            "passed": result.passed, "seconds": result.seconds, "counts": {name: getattr(stages, name) for name in labels}, "times": stages.times,
+            "passed": result.passed, "seconds": result.seconds, "times": stages.times,
+            "counts": {name: getattr(stages, name) for name in labels},
             "contract": result.contract, "findings": findings, "differences": list(result.comparison.differences),
             "batches": [dict(zip(("number", "records", "block", "gas", "gas_per_record", "transaction"), row,
                                  strict=True)) for row in batches],

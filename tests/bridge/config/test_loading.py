@@ -105,7 +105,7 @@ MISTAKES = {
     # The line, the key, what was given, what is allowed, and the nearest right word.
     'topcs = ["/a"]': "line 1: unknown key 'topcs'; did you mean 'topics'?",
     'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "line 4: unknown key 'max_sise' in spool; did you mean 'max_size'?",
-    'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: acknowledge, capture, channel, monitor, name, nodes, ",
+    'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: acknowledge, capture, channel, monitor, ",
     'topics = [{topic = "/a", rat = 1}]': "line 1: unknown key 'rat' in topics[0]; did you mean 'rate'?",
     'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
