@@ -92,7 +92,7 @@ class Web(ThreadingHTTPServer):
         if ":" in address[0]:
             self.address_family = socket.AF_INET6
         self._free = threading.BoundedSemaphore(AT_ONCE)
-        self._thread = threading.Thread(target=self.serve_forever, name="web", daemon=True)
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.1,), name="web", daemon=True)
         try:
             super().__init__(address, type("_BoardRequest", (_Request,), {"board": board}))
         except OSError as error:
