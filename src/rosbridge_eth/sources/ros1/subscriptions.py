@@ -35,6 +35,8 @@ MAX_CONNECTIONS = 512
 """Connections to publishers at once: file descriptors, of which a process usually has 1,024."""
 PARALLEL_CALLS = 8
 """Calls to the master under way at once."""
+DOORBELL_REST = 0.05
+"""Seconds after which a topic is registered again at the earliest, however often the doorbell rings."""
 FIRST_RETRY = 0.1
 LAST_RETRY = 10.0
 """Seconds between attempts to reach a publisher: doubled at each failure."""
@@ -161,7 +163,7 @@ class Subscriptions:
         state = self._topics.get(topic)
         if state is None:
             return
-        state.not_before = 0.0
+        state.not_before = state.registered_at + DOORBELL_REST
         if state.registration is _Registration.DONE:
             state.registration = _Registration.DUE
         elif state.registration is _Registration.ASKED:
@@ -283,7 +285,7 @@ class Subscriptions:
             return
         rung = topic.registration is _Registration.RUNG
         topic.registration = _Registration.DUE if rung else _Registration.DONE
-        topic.registered_at = now
+        topic.registered_at, topic.not_before = now, now + DOORBELL_REST
         if self._named_since is None and call.parameters[0] == self.node:
             self._named_since = now
         self._say(f"register {call.topic}", None)

@@ -11,6 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from rosbridge_eth.sources import Selection
 from rosbridge_eth.sources.ros1.subscriptions import (
+    DOORBELL_REST,
     LAST_RETRY,
     MAX_CONNECTIONS,
     PARALLEL_CALLS,
@@ -91,6 +92,8 @@ def test_the_doorbell_has_the_master_asked_and_nothing_believed():
     assert calls(subject.actions(1.1)) == []
     subject.answered(call(actions, "registerSubscriber"), [1, "", ["http://y:1/"]], 1.2)
     actions = subject.actions(1.2)
+    assert calls(actions) == []  # whoever rings all the time does not have the master asked all the time
+    actions += subject.actions(1.2 + DOORBELL_REST)
     assert Disconnect("/a", "http://x:1/") in actions
     assert Connect("/a", "http://y:1/") in actions
     assert calls(actions) == ["registerSubscriber /a"]
