@@ -56,7 +56,10 @@ Request: TypeAlias = RecordRequest | CheckRequest | RegisterRequest
 
 @dataclass(frozen=True, slots=True)
 class RecordStatus:
-    """Where a record is: 'unknown', 'stored', 'batched', 'submitted', 'included', 'confirmed', 'dead'."""
+    """Where a record is: 'unknown', 'stored', 'batched', 'submitted', 'included', 'confirmed', 'dead'.
+
+    'unavailable': the server cannot look at this moment; ask again.
+    """
 
     state: str
     transaction: str | None = None

@@ -6,30 +6,17 @@ port. What is asserted is what the chain holds at the end.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
-
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "load.py"
+from bridge.load_script import load_script
+
 SESSIONS, MESSAGES, WORKERS = 80, 10, 2
-
-
-@pytest.fixture(scope="module")
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("load", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["load"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+load = load_script()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("store", ["sqlite", "redis"])
-def test_every_record_of_many_robots_is_on_the_chain_once(load, store, tmp_path, require):
+def test_every_record_of_many_robots_is_on_the_chain_once(store, tmp_path, require):
     if store == "redis":
         require("redis-server")
     operator = load.Operator(tmp_path, "embedded", store, SESSIONS, lambda stage: None)
@@ -47,7 +34,7 @@ def test_every_record_of_many_robots_is_on_the_chain_once(load, store, tmp_path,
 
 
 @pytest.mark.slow
-def test_more_robots_than_places_for_handshakes_wait_and_get_in(load, tmp_path):
+def test_more_robots_than_places_for_handshakes_wait_and_get_in(tmp_path):
     """The caps on strangers delay honest robots behind one address, and keep none of them out."""
     operator = load.Operator(tmp_path, "embedded", "sqlite", 40, lambda stage: None)
     with operator.home.config.open("a") as file:

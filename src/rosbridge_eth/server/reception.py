@@ -90,7 +90,7 @@ class Reception:
                     self.counts["refused"] += 1
                     self._acknowledge(message, Ack.REFUSED)
                 case CheckRequest(id):
-                    self._reply(message, protocol.encode_answer(self._status_of(id)))
+                    self._reply(message, protocol.encode_answer(self._status(id)))
                 case RegisterRequest():
                     self._reply(message, protocol.encode_answer(self._registration_of(message.peer)))
         if arrived:
@@ -115,6 +115,13 @@ class Reception:
             if outcome is Outcome.CONFLICT:
                 log.error("record %s of %s: its identity is taken by other bytes", entry.record.id, entry.message.peer)
             self._acknowledge(entry.message, _ACKS[outcome])
+
+    def _status(self, id: RecordId) -> RecordStatus:
+        try:
+            return self._status_of(id)
+        except StoreError as error:
+            log.warning("a robot's question is not answered: %s", error)
+            return RecordStatus("unavailable")
 
     def _acknowledge(self, message: MessageReceived, ack: Ack) -> None:
         self.acks[ack] += 1

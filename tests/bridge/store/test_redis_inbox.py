@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import re
 import subprocess
 import sys
 import threading
 import traceback
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import redis
@@ -20,6 +22,7 @@ from rosbridge_eth.store.redis_inbox import RedisInbox
 
 T0 = 1_763_690_000.0
 A, B = b"a" * 32, b"b" * 32
+HOWTO = Path(__file__).parents[3] / "docs" / "howto-redis.md"
 SECRET = "pa:ss word%2F"
 
 
@@ -378,5 +381,26 @@ def test_a_user_without_the_right_to_look_at_the_settings_is_refused_with_the_re
         client.execute_command("ACL", "SETUSER", "bridge", "on", ">pw", "~*", "+@all", "-config")
     with pytest.raises(StoreError, match=r"may not use.*howto-redis"):
         RedisInbox(f"redis://bridge:pw@127.0.0.1:{server.port}/0", "x")
-    with server.client() as client, pytest.raises(redis.ResponseError):
-        client.execute_command("ACL", "SETUSER", "bridge", "nonsense")
+
+
+def test_the_rights_that_the_documentation_names_are_enough_and_touch_no_other_key(server):
+    command = re.search(r"ACL SETUSER .*?(?=\n```)", HOWTO.read_text(encoding="utf-8"), re.DOTALL)
+    assert command is not None
+    with server.client() as client:
+        client.execute_command(*command.group().split())
+    with RedisInbox(f"redis://bridge:PASSWORD@127.0.0.1:{server.port}/0", "x") as inbox:
+        inbox.append([record(n) for n in range(4)], T0)
+        inbox.append([record(0, size=300)], T0)
+        assert take(inbox, limit=3) == [0, 1, 2]
+        inbox.release("c", [record(2).id])
+        inbox.done([record(0).id], T0)
+        inbox.dead_letter([record(1).id], "reason", T0)
+        assert len(inbox.dead_letters()) == 2
+        assert inbox.state(record(2).id, T0) is State.WAITING
+        assert inbox.statistics(T0).done == 1
+        assert inbox.forget(T0 + 1) == 1
+    with redis.Redis(port=server.port, username="bridge", password="PASSWORD") as client:
+        with pytest.raises(redis.exceptions.NoPermissionError):
+            client.hget("another", "field")
+        with pytest.raises(redis.exceptions.NoPermissionError):
+            client.flushall()
