@@ -315,8 +315,11 @@ class Submitter:
         return not self._jobs
 
     def backlog(self) -> int:
-        """Batches on their way; whoever seals more should mind it."""
-        return sum(1 for job in self._jobs.values() if job.kind is Kind.BATCH)
+        """Batches on their way; whoever seals more should mind it.
+
+        Those of robots that may not write are not counted: they can wait for ever, and others must not wait with them.
+        """
+        return sum(1 for job in self._jobs.values() if job.kind is Kind.BATCH and job.robot not in self._blocked)
 
     def timings(self) -> list[BatchTiming]:
         """Of the batches confirmed since the last call."""

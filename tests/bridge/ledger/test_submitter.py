@@ -655,6 +655,7 @@ def test_a_robot_that_may_not_write_waits_and_holds_up_nobody(reason: str):
     assert {record.id.robot for record in world.model.written} == {OTHER_ROBOT}
     assert len(world.model.written) == 9
     assert list(world.submitter.status().blocked) == [ROBOT]
+    assert world.submitter.backlog() == 0  # what waits for a person keeps no other robot's records from being taken
     world.model.state.revoked.clear()
     world.model.state.accounts[ROBOT] = KEYRING.robot(7).address if reason == "replaced" else ACCOUNT.address
     world.accounts[ROBOT] = KEYRING.robot(7) if reason == "replaced" else ACCOUNT
