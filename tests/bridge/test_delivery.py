@@ -17,6 +17,7 @@ import pytest
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Event, MessageReceived, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.simulation import Faults, Network
+from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.protocol import Ack, RecordStatus, Registration
 from rosbridge_eth.records import RecordId, SealedRecord
 from rosbridge_eth.robot.sender import Sender
@@ -245,3 +246,19 @@ def test_the_robot_learns_its_registration_and_the_servers_time(tmp_path: Path) 
     assert world.run(20)
     assert world.sender.statistics.registration == world.registration
     assert times == [wall().timestamp()]
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x09", b"stored", b"{}"])
+def test_an_answer_that_is_none_ends_the_robot_with_a_sentence_and_keeps_the_records(
+    tmp_path: Path, payload: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(tmp_path, 1, Faults())
+    sealed = records(3)
+    world.keep(sealed)
+    monkeypatch.setattr(Reception, "_acknowledge", lambda self, message, ack: self._reply(message, payload))
+    with pytest.raises(NetworkError, match="same version"):
+        world.run(20)
+    monkeypatch.undo()
+    world.restart_robot()
+    assert world.run(60)
+    assert world.stored() == sealed

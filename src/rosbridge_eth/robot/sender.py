@@ -14,7 +14,16 @@ from typing import Literal
 
 from rosbridge_eth import protocol
 from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, MessageAnswered
-from rosbridge_eth.protocol import Ack, CheckRequest, RecordRequest, RecordStatus, RegisterRequest, Registration
+from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.protocol import (
+    Ack,
+    CheckRequest,
+    ProtocolError,
+    RecordRequest,
+    RecordStatus,
+    RegisterRequest,
+    Registration,
+)
 from rosbridge_eth.records import RecordId
 from rosbridge_eth.store import Spool
 
@@ -136,7 +145,12 @@ class Sender:
                     log.warning("no session: %s", why)
                 self.statistics.trouble = why
             case MessageAnswered(message_id=message, payload=payload):
-                self._answered(message, payload, now)
+                try:
+                    self._answered(message, payload, now)
+                except ProtocolError as error:  # nothing is lost: what was not acknowledged is in the spool
+                    raise NetworkError(
+                        f"the server gives an answer that is none here ({error}); use the same version on both ends"
+                    ) from error
 
     def _answered(self, message: int, payload: bytes, now: float) -> None:
         if message == self._register:
