@@ -7,6 +7,7 @@ act on is one sentence on stderr and never a traceback.
 from __future__ import annotations
 
 import os
+import sqlite3
 import sys
 from collections.abc import Sequence
 
@@ -41,6 +42,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `read | head`: whoever took the data has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.FAILED)
+    except OSError as error:  # a file or folder given by the user that cannot be read or written, a full disk
+        named = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
+        talk(f"rosbridge-eth: {named + ': ' if named else ''}{error.strerror or error}")
+        return int(ExitCode.FAILED)
+    except sqlite3.Error as error:  # what the stores make no sentence of themselves: a registry on a full disk
+        talk(f"rosbridge-eth: a database of this home cannot be used: {error}; check the disk and who may write there")
+        return int(ExitCode.STORE)
     except KeyboardInterrupt:
         talk("rosbridge-eth: interrupted")
         return 130

@@ -51,8 +51,11 @@ def join(home: RobotHome, bundle: Bundle, password: bytes, keys: Path | None = N
         if name not in files:
             if keys is None:
                 raise IdentityError("this bundle was made from requests; give the folder of your keys with --keys")
-            files[name] = (keys / name).read_bytes()
-    identity_from_files(files, password)  # refuse a bundle that could not be used before anything is written
+            try:
+                files[name] = (keys / name).read_bytes()
+            except OSError as error:
+                raise IdentityError(f"{keys / name} cannot be read: {error.strerror}") from error
+    identity, _ = identity_from_files(files, password)  # refuse what could not be used before anything is written
     home.path.mkdir(mode=0o700, parents=True, exist_ok=True)
     home.identity.mkdir(mode=0o700, exist_ok=True)
     home.readers.mkdir(mode=0o755, exist_ok=True)
@@ -62,6 +65,8 @@ def join(home: RobotHome, bundle: Bundle, password: bytes, keys: Path | None = N
         write_atomically(home.readers / f"{number}.pem", reader.encode())
     if not home.config.exists():
         write_atomically(home.config, FIRST_CONFIG.encode())
+    # The operator made the certificates at a time that has passed: a robot whose clock begins in 1970 may connect.
+    home.raise_clock_floor(identity.public.not_before.timestamp())
     home.save_bridge(
         BridgeEnd(bundle.name, bundle.server_name, bundle.server_address, bundle.contract, bundle.chain_id)
     )

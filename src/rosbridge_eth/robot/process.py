@@ -15,7 +15,6 @@ from collections.abc import Callable
 from rosbridge_eth.capture import CapturedRecord, RawMessage
 from rosbridge_eth.channel import Client
 from rosbridge_eth.channel.udp import UdpLoop
-from rosbridge_eth.errors import BridgeError
 from rosbridge_eth.robot.clock import clock_synchronised
 from rosbridge_eth.robot.recorder import Recorder
 from rosbridge_eth.robot.sender import Sender
@@ -52,7 +51,7 @@ class Robot:
         self._ring: queue.Queue[RawMessage] = queue.Queue(RING)
         self._stop = threading.Event()
         self._source_ended = threading.Event()
-        self._source_error: BridgeError | None = None
+        self._source_error: BaseException | None = None
         self._synchronised, self._asked_at = False, float("-inf")
         self.spool_left = 0
         """Records that the server had not acknowledged when `run` ended; the next run sends them."""
@@ -105,7 +104,7 @@ class Robot:
     def _read(self) -> None:
         try:
             self._source.run(self._emit, self._stop)
-        except BridgeError as error:
+        except BaseException as error:  # kept and raised in the thread that waits for this one
             self._source_error = error
         finally:
             self._source_ended.set()

@@ -1,0 +1,76 @@
+"""What goes wrong where no part of the bridge has a sentence of its own: still one line, a code, and nothing lost."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from bridge.test_cli import Capture, fails, made, place
+from rosbridge_eth.bundle import open_bundle
+from rosbridge_eth.capture import RawMessage
+from rosbridge_eth.cli import run
+from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.errors import ExitCode, IdentityError
+from rosbridge_eth.home import OperatorHome, RobotHome
+from rosbridge_eth.identity import Role, load_identity
+from rosbridge_eth.robot.assembly import join, open_robot
+from rosbridge_eth.robot.clock import certificate_clock
+
+__all__ = ["made", "place"]  # fixtures
+
+BUNDLE = "operator/bundles/robot_1.bundle"
+DAY_ONE = 42.0  # seconds after the first of January 1970: a clock without a battery
+
+
+def test_a_file_in_the_way_of_a_folder_is_one_line(place: Path, capsys: Capture) -> None:
+    Path("taken").write_text("not a folder")
+    error = fails(capsys, ExitCode.FAILED, "taken", "join", BUNDLE, "--home", "taken/robot", "--password-file", "word")
+    assert len(error.splitlines()) == 1
+    fails(capsys, ExitCode.FAILED, "taken", "init", "--home", "taken/operator", "--passphrase-file", "pass")
+
+
+def test_a_database_that_fails_while_it_is_used_is_one_line(place: Path, capsys: Capture) -> None:
+    holder = sqlite3.connect("operator/registry.sqlite", isolation_level=None)
+    holder.execute("ALTER TABLE enrolment RENAME COLUMN role TO part")  # opens, and fails at the first question
+    holder.close()
+    error = fails(capsys, ExitCode.STORE, "database", "status")
+    assert len(error.splitlines()) == 1
+
+
+def test_keys_that_are_not_there_are_named(place: Path) -> None:
+    bundle = open_bundle(Path(BUNDLE).read_bytes(), b"robot's")
+    for name in ("sign.key.pem", "enc.key.pem"):
+        del bundle.identity[name]
+    with pytest.raises(IdentityError, match=r"nowhere/sign\.key\.pem cannot be read"):
+        join(RobotHome(Path("other")), bundle, b"robot's", Path("nowhere"))
+    assert not Path("other").exists()
+
+
+def test_a_robot_whose_clock_begins_in_1970_believes_the_certificates_it_joined_with(place: Path) -> None:
+    home = RobotHome(Path("robot"))
+    identity, _ = load_identity(OperatorHome(Path("operator")).server, b"operator's")
+    at = certificate_clock(home, lambda: DAY_ONE)()
+    assert identity.role is Role.SERVER
+    assert identity.public.not_before <= at <= datetime.now(UTC)
+
+
+def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = RobotHome(Path("robot"))
+    Path("robot/robot.toml").write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
+    robot = open_robot(home, load_robot_config(home.config), b"robot's")
+
+    def breaks(emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
+        raise MemoryError("no room for this message")
+
+    monkeypatch.setattr(robot._source, "run", breaks)
+    with pytest.raises(MemoryError):
+        robot.run()
+
+
+def test_usage_is_still_told_by_its_own_code(place: Path) -> None:
+    assert run(["read"]) == ExitCode.USAGE
