@@ -111,6 +111,10 @@ class OperatorHome:
         return self.path / "journal.sqlite"
 
     @property
+    def submitter_lock(self) -> Path:
+        return self.path / "submitter.lock"
+
+    @property
     def bundles(self) -> Path:
         return self.path / "bundles"
 

@@ -1,7 +1,7 @@
 """A local anvil (Foundry's development node), started as a child process.
 
 `npx --yes @foundry-rs/anvil@VERSION` fetches it the first time. With a state file
-the chain survives a restart: anvil writes it when it is asked to end.
+the chain survives a restart: anvil writes it every few seconds, and when it is asked to end.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from rosbridge_eth.ledger.jsonrpc import JsonRpcChain
 VERSION = "1.7.1"
 START_SECONDS = 60.0  # the first start downloads it
 STOP_SECONDS = 10.0
+STATE_SECONDS = 5  # what a node that is killed loses of its chain, at most
 
 
 class Anvil:
@@ -108,7 +109,7 @@ def start(
         raise ChainError("a local chain needs anvil or, to fetch it, npx (of Node.js); install one of them")
     command += ["--host", "127.0.0.1", "--port", str(port), *options]
     if state is not None:
-        command += ["--state", str(state)]
+        command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
     if block_time is not None:
         command += ["--block-time", f"{block_time:g}"]
     output = log.open("ab") if log else None

@@ -181,10 +181,16 @@ def open_submission(
     registry: Registry,
     keys: Keyring,
     on_confirmed: Callable[[BatchTiming], None] = lambda timing: None,
+    holder: str | None = None,
 ) -> Submission:
-    """The submitter's process; `holder` in its leases is this process. on_confirmed: is given each confirmed batch."""
+    """The submitter's process. on_confirmed: is given each confirmed batch.
+
+    holder: the name in its leases, that of this process if none is given. A
+    name that outlives the process lets the next one go on at once; then no two
+    may bear it at a time (`sole_submitter`).
+    """
     settings = submitter_settings(config)
-    holder = f"{socket.gethostname()}:{os.getpid()}"
+    holder = holder or f"{socket.gethostname()}:{os.getpid()}"
     submitter = Submitter(
         journal,
         contract=contract.address,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
+import os
 import signal
 import threading
 import time
@@ -53,6 +54,7 @@ from rosbridge_eth.server.publishing import (
     worker_snapshot,
 )
 from rosbridge_eth.server.restarts import Restarts
+from rosbridge_eth.server.sole import sole_submitter
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +84,7 @@ class Supervisor:
         self._wire: Wire | None = None
         self._notifier = Notifier()
         self._stop = threading.Event()
+        self._pid = os.getpid()
 
     def stop(self) -> None:
         self._stop.set()
@@ -211,11 +214,17 @@ class Supervisor:
                         worker_snapshot(number, worker.server.statistics(), worker.loop, worker.reception)
                     )
 
-            worker.run(_terminated(), on_turn=publish)
+            worker.run(_terminated(self._pid), on_turn=publish)
 
         return work
 
     def _submit(self) -> None:
+        stopped = _terminated(self._pid)
+        with sole_submitter(self._home.submitter_lock, stopped) as holder:
+            if holder is not None:
+                self._submit_as(holder, stopped)
+
+    def _submit_as(self, holder: str, stopped: Callable[[], bool]) -> None:
         chain = open_chain(self._config)
         costs, pace = Costs(), Pace()
         submission = open_submission(
@@ -226,13 +235,14 @@ class Supervisor:
             registry=Registry(self._home.registry),
             keys=self._secrets.keys,
             on_confirmed=costs.add,
+            holder=holder,
         )
 
         def publish() -> None:
             if self._wire is not None and pace.due(time.monotonic()):
                 self._publish(costs.snapshot(submission, submission.status()))
 
-        submission.run(_terminated(), on_turn=publish)
+        submission.run(stopped, on_turn=publish)
 
     def _monitor_task(self, address: tuple[str, int], wire: Wire, expected: list[str]) -> Callable[[], None]:
         def watch() -> None:
@@ -253,16 +263,16 @@ class Supervisor:
                 StoreWatch(
                     open_inbox(self._config, self._home), open_journal(self._home, self._deployment), self._home.path
                 ),
-            ).run(_terminated())
+            ).run(_terminated(self._pid))
 
         return watch
 
 
-def _terminated() -> Callable[[], bool]:
-    """True once this process was asked to end."""
+def _terminated(parent: int) -> Callable[[], bool]:
+    """True once this process was asked to end, or `parent` is no more: nobody would end it then."""
     asked = threading.Event()
     signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
-    return asked.is_set
+    return lambda: asked.is_set() or os.getppid() != parent
 
 
 def _child(task: Callable[[], None]) -> None:

@@ -101,6 +101,10 @@ class Inbox(Protocol):
         """Give back unfinished what `consumer` leased; others' leases are left alone."""
         ...
 
+    def reclaim(self, consumer: str) -> None:
+        """Give back all that `consumer` leased: it has just started, and knows of none that an earlier life took."""
+        ...
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         """The journal has these: let go of the bytes, remember the identities. Unknown or finished ones: no effect."""
         ...

@@ -181,6 +181,17 @@ function operations.release(consumer)
   end
 end
 
+-- reclaim consumer: all that it leased is released
+function operations.reclaim(consumer)
+  for _, robot in ipairs(call('ZRANGE', LINE, 0, -1)) do
+    if call('HGET', HOLDER, robot) == consumer then
+      local places = call('ZRANGE', LEASE .. robot, 0, -1)
+      call('DEL', LEASE .. robot)
+      for _, place in ipairs(places) do call('XCLAIM', RECORDS, GROUP, NOBODY, 0, id_in(place), 'JUSTID') end
+    end
+  end
+end
+
 -- finish "1"|"2" reason now {ROBOT stream seq}: done, or dead for that reason
 function operations.finish(state, reason, now)
   local records, bytes = 0, 0

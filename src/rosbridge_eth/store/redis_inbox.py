@@ -148,6 +148,9 @@ class RedisInbox:
     def release(self, consumer: str, ids: Iterable[RecordId]) -> None:
         self._for_each(ids, "release", consumer)
 
+    def reclaim(self, consumer: str) -> None:
+        self._call("reclaim", consumer)
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         self._for_each(ids, "finish", _CODES[State.DONE], "", repr(now))
 

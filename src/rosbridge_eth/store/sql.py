@@ -130,6 +130,8 @@ INBOX_LEASE: Final = "UPDATE record SET lessee = ?, until = ?, attempts = attemp
 INBOX_RELEASE: Final = """
 UPDATE record SET lessee = '', until = 0 WHERE robot = ? AND stream = ? AND seq = ? AND lessee = ?
 """
+# All that one consumer has, whatever the robot.
+INBOX_RECLAIM: Final = "UPDATE record SET lessee = '', until = 0 WHERE lessee = ?"
 INBOX_DEAD: Final = """
 SELECT tk, id, seq, ciphertext, conflict, reason, at
 FROM dead JOIN stream ON dead.stream = stream.no JOIN robot ON stream.robot = robot.no

@@ -126,6 +126,10 @@ class SqliteInbox:
                 sql.INBOX_RELEASE, [(*place, _seq(id), consumer) for place, id in placed if place is not None]
             )
 
+    def reclaim(self, consumer: str) -> None:
+        with self._writing() as db:
+            db.execute(sql.INBOX_RECLAIM, (consumer,))
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         self._finish(ids, State.DONE, "", now)
 

@@ -193,6 +193,24 @@ def test_released_records_are_given_out_again_in_order(inbox):
     assert seqs(take(inbox, "two")) == [0, 1, 2, 3]
 
 
+def test_a_consumer_that_starts_again_takes_back_what_its_earlier_life_had(inbox):
+    inbox.append([record(n) for n in range(3)] + [record(0, robot=B)], T0)
+    taken = take(inbox, "one", robot=A)
+    assert seqs(taken) == [0, 1, 2]
+    inbox.reclaim("two")
+    assert take(inbox, "two", robot=A) == []
+    assert ids(take(inbox, "two", robot=B)) == [RecordId(B, S1, 0)]
+    inbox.reclaim("one")
+    assert take(inbox, "one", robot=B) == []  # another's, still
+    again = take(inbox, "one", robot=A)
+    assert seqs(again) == [0, 1, 2]
+    assert [entry.attempts for entry in again] == [2, 2, 2]
+    assert take(inbox, "two", robot=A) == []
+    inbox.done(ids(again), T0)
+    inbox.reclaim("one")
+    assert take(inbox, "one", robot=A) == []
+
+
 # --- the end of a record
 
 
