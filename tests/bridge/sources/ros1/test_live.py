@@ -171,6 +171,7 @@ def test_a_node_means_the_topics_it_publishes(graph):
         graph.call("unregisterPublisher", "/base/a", "")  # of nobody: changes nothing
         assert set(listening.data) == {"/base/a", "/base/b", "/shared_name"}
         assert not graph.subscribers("/other")
+        assert not graph.subscribers("/rosout")  # which both nodes publish, as every node does
         # As `rosnode cleanup` does it for a node that is gone.
         graph.kill(base)
         for topic in ("/base/a", "/base/b"):
