@@ -289,7 +289,7 @@ class Ros2Source:
             topic.subscription = self._subscribe(topic, topic.quality)
         except SourceError as error:
             self._unusable.add(key)
-            log.warning("%s is left out: %s", offer.topic, error)
+            log.warning("%s is left out: %s", offer, error)
             return
         self._topics[key] = topic
         log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)

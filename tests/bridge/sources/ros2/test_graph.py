@@ -311,8 +311,8 @@ def test_what_cannot_be_decoded_is_told_and_does_no_harm(ros: Graph, tmp_path):
     path = os.pathsep.join([str(shadow.parent), ros.environment["PYTHONPATH"]])
     watcher = ros.watcher('topics = ["/**"]', PYTHONPATH=path)
     watcher.recorded(1)
-    watcher.says("/absent is left out: message type sensor_msgs/msg/Imu is not installed here; install package")
-    watcher.says("/wide is left out: test_msgs/msg/WStrings.wstring_value is a wstring")
+    watcher.says("/absent (sensor_msgs/msg/Imu) is left out: message type sensor_msgs/msg/Imu is not installed here")
+    watcher.says("/wide (test_msgs/msg/WStrings) is left out: test_msgs/msg/WStrings.wstring_value is a wstring")
     assert "/good" in (watched := watcher.stop())
     assert not {"/absent", "/wide"} & watched.keys()
     assert len(watcher.errors) == len(set(watcher.errors))  # each is said once
@@ -369,3 +369,20 @@ hashes = json.loads((share / "test_msgs/msg/Builtins.json").read_text())["type_h
 (found,) = [each["hash_string"] for each in hashes if each["type_name"] == "test_msgs/msg/Builtins"]
 print(json.dumps([str(lib / "libtest_msgs__rosidl_generator_c.so"), found]))
 """
+
+
+def test_two_types_under_one_name_do_no_harm(ros: Graph):
+    """A DDS participant can hear one of them; that one, and whatever else there is, is recorded."""
+    first, second = ros.node("/first"), ros.node("/second")
+    first.order(create="/t", type=STRING, latched=True)
+    second.order(create="/t", type=NUMBER, latched=True)
+    first.order(create="/good", type=STRING, latched=True)
+    first.order(publish="/t", fields={"data": "x"})
+    second.order(publish="/t", fields={"data": 5})
+    first.order(publish="/good", fields={"data": "y"})
+    watcher = ros.watcher('topics = ["/t", "/good"]')
+    watcher.until(lambda: len({record["topic"] for record in watcher.records}) == 2, "a message of each topic")
+    heard = [(record["type"], record["data"]["data"]) for record in watcher.records if record["topic"] == "/t"]
+    assert heard in ([(STRING, "x")], [(NUMBER, 5)])
+    watcher.says(f"/t ({NUMBER if heard[0][0] == STRING else STRING}) is left out: it cannot be subscribed to")
+    assert watcher.stop().keys() == {"/t", "/good"}
