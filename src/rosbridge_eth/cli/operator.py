@@ -1,4 +1,4 @@
-"""The operator's commands: init, chain, deploy, register, reader, revoke, export, server, check."""
+"""The operator's commands: init, chain, deploy, register, reader, revoke, renew, export, server, check."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth register robot_1")(register)
     app.command(name="reader", epilog="Example: rosbridge-eth reader analyst")(add_reader)
     app.command(epilog="Example: rosbridge-eth revoke robot_1")(revoke)
+    app.command()(renew)
     app.command(epilog="Example: rosbridge-eth export robot_1 keystore.json")(export)
     app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
     app.command(epilog="Example: rosbridge-eth check robot_1 0f3a… 17")(check)
@@ -191,6 +192,16 @@ def revoke(
     finally:
         node.close()
     talk(f"{role} {name} is revoked" + (f", on the chain in block {block}." if block is not None else "."))
+
+
+def renew(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
+    """Give the server new keys and certificates, before the old ones expire; then start the server again."""
+    from rosbridge_eth.server.administration import load_ca, renew_server
+
+    place = OperatorHome(home).require()
+    passphrase = _passphrase(passphrase_file)
+    old = renew_server(place, ca=load_ca(place, passphrase), passphrase=passphrase, now=_now())
+    talk(f"The server has new keys; those before are in {old}. Start the server again; robots need nothing.")
 
 
 def export(

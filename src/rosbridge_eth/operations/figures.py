@@ -204,3 +204,12 @@ def _value(value: float | Sequence[object]) -> float | tuple[tuple[int, ...], fl
         return float(value)
     counts, total = value
     return tuple(counts), total  # type: ignore[arg-type, return-value]
+
+
+def reference() -> str:
+    """METRICS as the table of docs/operations.md, which a test compares."""
+    lines = ["| metric | kind | labels | |", "| --- | --- | --- | --- |"]
+    for metric in METRICS.values():
+        labels = ", ".join(f"`{label}`" for label in metric.labels)
+        lines.append(f"| `{metric.shown}` | {metric.kind} | {labels} | {metric.help} |")
+    return "\n".join(lines) + "\n"

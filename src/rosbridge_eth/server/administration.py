@@ -7,6 +7,7 @@ chain is ordered so that it can be run again after a crash between any two.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -311,6 +312,27 @@ def revoke(home: OperatorHome, role: Role, name: str, *, keys: Keyring, chain: C
             raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
         return None
     return contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number
+
+
+def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime) -> Path:
+    """Give the server new keys and certificates under its name; where the old ones are kept.
+
+    Robots know the server by its name and the CA, so nothing changes for them.
+    A running server goes on with the old ones until it is started again.
+    """
+    name = load_server_config(home.config).name
+    identity = enrol(ca, Role.SERVER, name, at=now)
+    made, old = home.path / "server.new", home.path / f"server.until-{now:%Y%m%dT%H%M%SZ}"
+    shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
+    save_identity(made, identity, [ca.certificate], passphrase)
+    home.server.rename(old)
+    made.rename(home.server)
+    registry = Registry(home.registry)
+    try:
+        _register(registry, identity.public, None, now, replace=True)
+    finally:
+        registry.close()
+    return old
 
 
 def load_server_identity(home: OperatorHome, passphrase: bytes) -> Identity:

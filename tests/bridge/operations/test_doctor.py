@@ -6,16 +6,18 @@ import json
 import shutil
 import socket
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bridge.operations.conftest import PASSWORD, Place
+from bridge.operations.conftest import PASSPHRASE, PASSWORD, Place
 from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_robot_config, load_server_config
 from rosbridge_eth.errors import ExitCode
+from rosbridge_eth.identity import Role, Trust, read_certificates
 from rosbridge_eth.records import RecordId, SealedRecord, robot_id
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot.assembly import open_robot
@@ -55,7 +57,7 @@ def server(place: Place) -> Iterator[Address]:
     [sock] = server_sockets(config.listen)
     registry = Registry(place.operator.registry)
     worker = open_worker(
-        0, sock, config=config, identity=load_server_identity(place.operator, b"the operator's own words"),
+        0, sock, config=config, identity=load_server_identity(place.operator, PASSPHRASE),
         trust=server_trust(place.operator, registry), registry=registry, inbox=open_inbox(config, place.operator),
         journal=open_journal(place.operator, deployment), deployment=deployment,
     )
@@ -86,8 +88,6 @@ def test_without_the_password_the_session_is_not_tried_and_that_is_no_failure(pl
 def test_a_revoked_robot_learns_that_it_is_refused_rather_than_unheard(
     place: Place, server: Address, capsys: Capture
 ):
-    from datetime import UTC, datetime
-
     registry = Registry(place.operator.registry)
     registry.revoke("robot", "robot_1", datetime.now(UTC))
     registry.close()
@@ -181,3 +181,24 @@ def test_status_tells_a_robots_home_from_an_operators(place: Place, capsys: Capt
     shown = capsys.readouterr()
     assert "not running" in shown.out and "127.0.0.1:9" in shown.err
     assert not any(secret in shown.out + shown.err for secret in ("node-key", "path-key", "query-key"))
+
+
+def test_a_renewed_server_is_still_the_server_its_robots_know(place: Place, capsys: Capture):
+    before = load_server_identity(place.operator, PASSPHRASE)
+    assert run(["renew", "--passphrase-file", "pass"]) == 0
+    after = load_server_identity(place.operator, PASSPHRASE)
+    assert after.name == before.name
+    assert after.signing_certificate.fingerprint() != before.signing_certificate.fingerprint()
+    assert after.signing_key.public_key.to_bytes() != before.signing_key.public_key.to_bytes()
+    roots = read_certificates((place.robot.identity / "ca.crt.pem").read_bytes())
+    Trust(roots).check(
+        after.signing_certificate.to_der(), after.encryption_certificate.to_der(), role=Role.SERVER, name="server",
+        at=datetime.now(UTC),
+    )
+    registry = Registry(place.operator.registry)
+    assert registry.allows("server", "server", after.signing_certificate.fingerprint())
+    assert not registry.allows("server", "server", before.signing_certificate.fingerprint())
+    assert [old.is_dir() for old in place.operator.path.glob("server.until-*")] == [True]
+    assert run(["renew", "--passphrase-file", "word"]) == ExitCode.IDENTITY
+    assert "Traceback" not in capsys.readouterr().err
+    assert load_server_identity(place.operator, PASSPHRASE).name == "server", "a wrong passphrase changes nothing"
