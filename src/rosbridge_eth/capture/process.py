@@ -17,9 +17,13 @@ from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
 from rosbridge_eth.capture.paths import DEFAULT_FIELDS, EVERYTHING, Selection, parse_paths
 from rosbridge_eth.capture.record import CapturedRecord
 from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, rule_for
+from rosbridge_eth.errors import ConfigError
 
 MAX_DATA = 30 * 1024
 """Bytes of one record's data as JSON, so that what is sealed never exceeds 32 KiB even if it does not compress."""
+
+MAX_CONVERSIONS = 8
+"""Of one topic, for as many types or definitions; a publisher may bring another one with each of its connections."""
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +32,7 @@ class Cause(StrEnum):
     """Why a message was not captured as it came."""
 
     FIELD_DIGESTED = "field_digested"  # captured, with a digest in place of a large field
+    FIELD_MISSING = "field_missing"
     FIELD_TOO_LARGE = "field_too_large"
     RECORD_TOO_LARGE = "record_too_large"
     UNDECODABLE = "undecodable"
@@ -80,21 +85,26 @@ class Capture:
     """Captures by rules; a topic that none of them names or matches is not captured.
 
     notify: is given each Notice; by default it is logged as a warning.
+    live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
+    that is an error of the configuration.
     """
 
-    def __init__(self, rules: Sequence[TopicRule], notify: Callable[[Notice], None] = _log) -> None:
+    def __init__(
+        self, rules: Sequence[TopicRule], notify: Callable[[Notice], None] = _log, *, live: bool = False
+    ) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
         self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
         self._selections = {id(rule): parse_paths(rule.fields) for rule in rules if rule.fields}
         self._topics: dict[str, _Topic | None] = {}
         self._notify = notify
+        self._live = live
 
     def process(
         self, raw: RawMessage, wall_ns: int, mono_ns: int, clock_synchronised: bool = False
     ) -> CapturedRecord | None:
         """The record of a message, or None if it is not due, refused or cannot be decoded.
 
-        Raises ConfigError if the rule names a field that the message's type does not have.
+        Raises ConfigError if the rule names a field that the message's type does not have, unless `live`.
         """
         topic = self._topic(raw.topic)
         if topic is None:
@@ -102,7 +112,14 @@ class Capture:
         if not topic.schedule.due(raw.received_ns):
             topic.not_due += 1
             return None
-        conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
+        try:
+            conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
+        except ConfigError as error:
+            if not self._live:
+                raise
+            topic.refused += 1
+            self._say(raw.topic, topic, Cause.FIELD_MISSING, f"a message is left out: {error}")
+            return None
         digested_before = conversion.digested
         try:
             data = conversion.convert(raw.decoder.decode(raw.raw))
@@ -183,6 +200,8 @@ class Capture:
             defaults = DEFAULT_FIELDS.get(decoder.type_name)
             selection = parse_paths(defaults) if defaults else EVERYTHING
         conversion = Conversion(decoder, selection, limit=topic.rule.limit, oversize=topic.rule.oversize)
+        while len(topic.conversions) >= MAX_CONVERSIONS:
+            del topic.conversions[next(iter(topic.conversions))]
         topic.conversions[decoder] = conversion
         return conversion
 

@@ -102,7 +102,7 @@ def open_robot(
     readers = reader_keys(config, home, roots)
     source_config, _ = config.source_and_why(os.environ)
     source = open_source(source_config.settings(), config.selection())
-    capture = Capture(config.rules())
+    capture = Capture(config.rules(), live=source.live)
     for topic, decoders in source.decoders().items():
         for decoder in decoders:
             capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message

@@ -7,7 +7,7 @@ from struct import pack
 import pytest
 
 from rosbridge_eth.capture import Capture, CapturedRecord, Cause, RawMessage, TopicRule, Wire, decoder_for
-from rosbridge_eth.capture.process import MAX_DATA
+from rosbridge_eth.capture.process import MAX_CONVERSIONS, MAX_DATA
 from rosbridge_eth.errors import ConfigError
 
 NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")
@@ -98,6 +98,30 @@ def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
         capture.check("/n", NUMBER)
     with pytest.raises(ConfigError, match="has no field 'y'"):
         capture.process(number(1), 0, 0)
+
+
+def test_a_live_publisher_of_a_type_without_the_field_does_not_end_the_robot():
+    notices = []
+    capture = Capture([TopicRule("/x", fields=("data",))], notices.append, live=True)
+    assert capture.process(blob(1, "/x"), 0, 0) is not None
+    assert capture.process(number(1, topic="/x"), 0, 0) is None
+    assert capture.process(number(2, topic="/x"), 0, 0) is None
+    assert capture.process(blob(1, "/x"), 0, 0) is not None
+    assert [notice.cause for notice in notices] == [Cause.FIELD_MISSING]
+    assert "has no field 'data'" in notices[0].text
+    statistics = capture.statistics()["/x"]
+    assert (statistics.seen, statistics.captured, statistics.refused) == (4, 2, 2)
+
+
+def test_definitions_that_come_and_go_are_not_kept_for_ever():
+    capture = Capture([TopicRule("/x")], live=True)
+    for number_ in range(50):
+        decoder = decoder_for(Wire.ROS1, "pkg/Number", f"int32 x{number_}")
+        raw = RawMessage("/x", "pkg/msg/Number", 0, pack("<i", number_), decoder)
+        assert capture.process(raw, 0, 0).data == {f"x{number_}": number_}
+    (topic,) = capture._topics.values()
+    assert len(topic.conversions) <= MAX_CONVERSIONS
+    assert capture.process(number(7, topic="/x"), 0, 0).data == {"x": 7}
 
 
 def test_types_may_change_under_a_topic():
