@@ -39,6 +39,7 @@ def demo(
     from rosbridge_eth.sources.sample import sample_bag
 
     log_to_stderr()
+    report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen = bag or sample_bag()
     topics = topic or [f"/{ROBOT}/odom"]
     columns = (TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -55,7 +56,6 @@ def demo(
             on_stage=lambda text: progress.console.print(f"· {text}"), on_progress=show,
         )
     stages = result.stages
-    report.mkdir(parents=True, exist_ok=True)
     proven = [record.proven for record in result.records]
     (report / "records.jsonl").write_text("".join(outputs.json_line(record) for record in proven), encoding="utf-8")
     outputs.draw_trajectory(report / "trajectory.png", proven)

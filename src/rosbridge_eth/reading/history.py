@@ -322,12 +322,16 @@ class _Proof:
         """Seq has to grow along the chain: over what is proven, or all where nothing can be."""
         items = stream.items if stream.key is None else [record.item for record in stream.opened.values()]
         highest, seen = -1, set[int]()
+        late: dict[int, list[ChainItem]] = defaultdict(list)
         for item in sorted(items, key=_position):
             seq = item.record.id.seq
             if seq < highest and seq not in seen:
-                self._find(FindingKind.REORDERED, item.record.id, item)
+                late[item.block_number].append(item)
             highest = max(highest, seq)
             seen.add(seq)
+        for of_block in late.values():  # one finding for neighbours: a bad network reorders hundreds
+            for part in _ranges(stream.id, {item.record.id.seq for item in of_block}):
+                self._find(FindingKind.REORDERED, part, of_block[0])
 
     def _prove_stream(self, stream: _Stream) -> None:
         by_seq: dict[int, list[ChainItem]] = defaultdict(list)
