@@ -238,7 +238,7 @@ def test_a_node_that_takes_our_name_does_not_silence_us(graph):
         eventually(lambda: "/recorder" in graph.subscribers("/contested"), "the first has the name")
         with Listening(graph.uri, ["/contested"], node="/recorder") as second:
             eventually(lambda: len(graph.subscribers("/contested")) == 2, "the first goes on under another name")
-            graph.publish("speaker", {"topic": "/contested", "kind": "number", "count": 10})
+            graph.publish("speaker", {"topic": "/contested", "kind": "number", "rate": 50})
             first.wait_for("/contested", 10)
             second.wait_for("/contested", 10)
 
