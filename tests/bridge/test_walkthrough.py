@@ -44,5 +44,8 @@ def test_the_walkthrough_runs_as_it_is_written(tmp_path: Path, require: Callable
     records = [json.loads(line) for line in (tmp_path / "records.jsonl").read_text().splitlines()]
     assert len(records) == 50
     assert {record["topic"] for record in records} == {"/robot_1/odom"}
+    analysts = [json.loads(line) for line in (tmp_path / "analyst.jsonl").read_text().splitlines()]
+    assert len(analysts) == 50, "the second run alone was sealed for the second reader"
+    assert not {r["proof"]["stream"] for r in analysts} & {r["proof"]["stream"] for r in records}
     assert (tmp_path / "trajectory.png").stat().st_size > 5_000
     assert "revoked" in out
