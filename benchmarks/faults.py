@@ -3,7 +3,7 @@
     python benchmarks/faults.py [--fault NAME ...] [--seed N] [--rounds N] [--json FILE]
 
 A node (anvil), a server with two workers and robots are started as an operator
-starts them, by `python -m rosbridge_eth`. Each robot replays the first 150
+starts them, by `python -m rosbridge_eth`. Each robot replays the first 100
 Odometry messages of the sample bag, so what it says is known. While they flow, at moments
 drawn from the seed, something is killed, filled, cut or confused. Then the
 chain is read as a reader does it, and held against two truths that the server
@@ -38,6 +38,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -58,8 +59,8 @@ from rosbridge_eth.sources.sample import sample_bag
 from rosbridge_eth.store import Spool
 
 TOPIC = "/robot_1/odom"
-MESSAGES, PACE = 150, 5  # times as fast as recorded
-FLOW = 3.0  # seconds, as it comes to
+MESSAGES, PACE = 100, 5  # times as fast as recorded
+FLOW = 2.0  # seconds, as it comes to
 PATIENCE = 30.0  # seconds within which every recovery has to be over
 BAD_NETWORK = Harm(loss=0.2, duplicate=0.1, reorder=0.2)
 PACKAGE = Path(rosbridge_eth.__file__).parents[1]
@@ -208,6 +209,7 @@ class Count:
     events: list[str] = field(default_factory=list)
 
 
+@cache
 def known() -> list[CapturedRecord]:
     """What the bag says, in order."""
     bag, capture = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC])), Capture([TopicRule(TOPIC)])
@@ -287,7 +289,7 @@ class Site:
     def start_node(self) -> None:
         self.node = node = Program(
             self.folder / "node.log",
-            ["chain", "--home", str(self.home.path), "--port", str(self.node_port), "--block-time", "0.5"], {},
+            ["chain", "--home", str(self.home.path), "--port", str(self.node_port), "--block-time", "0.2"], {},
         )
         until("the node answers", lambda: "A local chain answers" in node.said or node.ended())
         assert not node.ended(), node.said
@@ -383,18 +385,19 @@ class Site:
         finally:
             journal.close()
 
-    def outstanding(self, *, revoked: bool = False) -> str:
-        """What the server has still to do; empty if nothing. revoked: but for what it holds back."""
+    def outstanding(self, robot: bytes, *, revoked: bool = False) -> str:
+        """What the server has still to do for a robot; empty if nothing. revoked: but for what it holds back."""
         config, deployment = load_server_config(self.home.config), self.home.deployment()
         journal, inbox = open_journal(self.home, deployment), open_inbox(config, self.home)
         try:
-            queue, batches = inbox.statistics(time.time()), journal.counts()
+            queue = inbox.statistics(time.time())
+            batches = Counter(str(job.state) for job in journal.jobs() if job.robot == robot)
         finally:
             journal.close()
             inbox.close()
         final = {"confirmed", "acknowledged", "dead", "void", "split", *(["sealed"] if revoked else [])}
         parts = [f"{queue.waiting + queue.leased} records in the inbox"] if queue.waiting + queue.leased else []
-        return ", ".join(parts + [f"{n} batches {state}" for state, n in batches.items() if n and state not in final])
+        return ", ".join(parts + [f"{n} batches {state}" for state, n in batches.items() if state not in final])
 
     def dead_letters(self, robot: bytes) -> set[RecordId]:
         config = load_server_config(self.home.config)
@@ -522,9 +525,10 @@ class Flow:
         """
         count, site = self.count, self.site
         try:
-            until("the server has nothing left to do", lambda: not site.outstanding(revoked=revoked))
+            until("the server has nothing left to do", lambda: not site.outstanding(self.robot, revoked=revoked))
         except Stuck as stuck:
-            raise Stuck(f"{stuck}: {site.outstanding()}\n{site.server and site.server.said[-3000:]}") from None
+            said = site.server.said[-3000:] if site.server is not None else ""
+            raise Stuck(f"{stuck}: {site.outstanding(self.robot)}\n{said}") from None
         reading = site.read(self.name)
         if self.relay is not None:
             self.relay.close()
@@ -777,7 +781,7 @@ def clock_jumps(site: Site, seed: int) -> Count:
 
 def revoked(site: Site, seed: int) -> Count:
     """The robot is revoked while it sends: its session ends, and what did not get onto the chain has a name."""
-    flow = Flow(site, "robot revoked", seed, pace=1)  # it would go on for 15 s
+    flow = Flow(site, "robot revoked", seed, pace=1)  # it would go on for 10 s
     program = flow.start()
     flow.pause(0.3, 0.9)
     site.revoke(flow.name)

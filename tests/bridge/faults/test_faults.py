@@ -1,0 +1,85 @@
+"""Faults in the real processes: whatever fails, every record is on the chain exactly once or has a name.
+
+benchmarks/faults.py has the processes, the faults and the account. One run of
+each by default, the lone kills as parts of `several`; FAULTS=all runs every
+fault by itself, FAULTS_SEED repeats a run, FAULTS_ROUNDS=N runs each N times.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from conftest import unavailable
+
+SOURCE = Path(__file__).resolve().parents[3] / "benchmarks" / "faults.py"
+
+
+def _load() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("faults", SOURCE)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["faults"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+faults = _load()
+IN_SEVERAL = {"robot", "worker", "submitter", "network"}
+CHOSEN = [name for name in faults.FAULTS if os.environ.get("FAULTS") == "all" or name not in IN_SEVERAL]
+SEED = int(os.environ.get("FAULTS_SEED") or random.SystemRandom().randrange(1 << 31))
+ROUNDS = int(os.environ.get("FAULTS_ROUNDS", "1"))
+
+pytestmark = [pytest.mark.service, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[bool, object]]:
+    """The site with the inbox in SQLite, and the one with the inbox in Redis, opened when they are first used."""
+    with ExitStack() as stack:
+
+        class Sites(dict[bool, object]):
+            def __missing__(self, redis: bool) -> object:
+                folder = tmp_path_factory.mktemp("site")
+                self[redis] = stack.enter_context(faults.open_site(folder, redis=redis))
+                return self[redis]
+
+        yield Sites()
+
+
+@pytest.mark.parametrize("number", range(ROUNDS))
+@pytest.mark.parametrize("name", CHOSEN)
+def test_every_record_is_on_the_chain_once_or_has_a_name(sites: dict[bool, object], name: str, number: int) -> None:
+    print(f"FAULTS_SEED={SEED}")
+    try:
+        count = faults.FAULTS[name](sites[name in faults.ON_REDIS], SEED + number)
+    except faults.Unavailable as reason:
+        unavailable(str(reason))
+    print(faults.table([count]), *count.events, sep="\n")
+    assert count.injected > 0
+    assert (count.missing, count.doubled, count.altered) == (0, 0, 0), count
+    assert count.findings == [], count
+    assert count.sealed == count.on_chain + count.declared
+    if name == "revoked":
+        assert 0 < count.on_chain < count.sealed
+    else:
+        # Each life that ran to its end said all of the bag, between the records that open and end its stream.
+        assert count.on_chain >= faults.MESSAGES + 2
+        assert count.declared == 0
+    if name == "twins":
+        assert count.on_chain >= 2 * (faults.MESSAGES + 2)
+
+
+def test_the_report_is_a_table_of_what_was_counted() -> None:
+    count = faults.Count("robot killed", 7, injected=2, lives=3, sealed=302, acknowledged=300, on_chain=301, missing=1)
+    heads, row = faults.table([count]).splitlines()
+    assert heads.split()[:6] == ["fault", "times", "lives", "sealed", "acked", "on"]
+    assert row.split() == ["robot", "killed", "2", "3", "302", "300", "301", "0", "0", "1", *"00000", "0"]
