@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import getpass
 import hmac
 import importlib
@@ -244,6 +245,26 @@ def test_a_command_line_that_makes_no_sense_exits_with_2() -> None:
     with pytest.raises(SystemExit) as exit:
         main(["no-such-command"])
     assert exit.value.code == 2
+
+
+def test_a_password_for_a_key_that_is_not_encrypted_is_refused(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sign", "--key", "key.pem", "--password-file", "password", "-o", "sig", "message"]) == 1
+    assert "the private key is not encrypted" in capsys.readouterr().err
+    assert not Path("sig").exists()
+
+
+def test_names_that_the_terminal_cannot_write_are_escaped(folder: Path) -> None:
+    Path("报文").write_bytes(b"abc")
+    done = subprocess.run([sys.executable, "-m", "smcrypto", "hash", "报文"], capture_output=True, check=True,
+                          env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"})  # fmt: skip
+    assert done.stdout == f"{ABC_DIGEST}  \\u62a5\\u6587\n".encode() and done.stderr == b""
+
+
+def test_output_goes_wherever_stdout_was_redirected_to(folder: Path) -> None:
+    Path("报文").write_bytes(b"abc")
+    with contextlib.redirect_stdout(io.StringIO()) as redirected:
+        assert main(["hash", "报文"]) == 0
+    assert redirected.getvalue() == f"{ABC_DIGEST}  报文\n"
 
 
 def test_an_encrypted_key_needs_its_password(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:

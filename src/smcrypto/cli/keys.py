@@ -61,9 +61,13 @@ def uid_bytes(text: str) -> bytes:
 
 
 def load_private(path: Path, options: argparse.Namespace) -> sm2.PrivateKey:
-    """The key in a file; the password, where it is encrypted, comes from what `options` name."""
+    """The key in a file; the password, where it is encrypted, comes from what `options` name.
+
+    One that is named for a key which is not encrypted is InvalidKey: somebody takes the key to be protected.
+    """
     data = path.read_bytes()
-    password = passwords.read_password(options, f"Password for {path}") if _ENCRYPTED in data else None
+    wanted = _ENCRYPTED in data or passwords.named(options)
+    password = passwords.read_password(options, f"Password for {path}") if wanted else None
     return sm2.PrivateKey.from_pem(data, password=password)
 
 
