@@ -10,8 +10,6 @@ import subprocess
 from pathlib import Path
 
 import redis
-from redis.backoff import ConstantBackoff
-from redis.retry import Retry
 
 from conftest import unavailable
 
@@ -42,22 +40,23 @@ class RedisServer:
         with (self.folder / "redis.log").open("ab") as log:
             self._process = subprocess.Popen(self._arguments, stdout=log, stderr=log)
         with self.client() as client:
-            for _ in range(100):
+            for _ in range(500):
                 try:
                     client.ping()
                     return
                 except redis.exceptions.AuthenticationError:
                     return
                 except redis.RedisError:
-                    if self._process.poll() is not None:
+                    try:
+                        self._process.wait(0.02)
                         break
+                    except subprocess.TimeoutExpired:
+                        continue
         raise RuntimeError((self.folder / "redis.log").read_text())
 
     def client(self, **more) -> redis.Redis:
-        """A plain client, which waits for a server that is just starting."""
-        starting = [redis.ConnectionError, redis.exceptions.BusyLoadingError]
-        patience = Retry(ConstantBackoff(0.02), 250)
-        return redis.Redis(port=self.port, retry=patience, retry_on_error=starting, **more)
+        """A plain client."""
+        return redis.Redis(port=self.port, **more)
 
     def kill(self) -> None:
         """SIGKILL."""
