@@ -300,7 +300,7 @@ def test_what_a_robot_publishes_is_sealed_and_spooled(graph, tmp_path):
             )
             eventually(lambda: recorder.times.records == 45, "45 records")
         recorder.finish(wall_ns=time.time_ns(), now=time.monotonic())
-        opening, *records, end = spool.pending(100, 1 << 22)
+        opening, *records, end = sorted(spool.pending(100, 1 << 22), key=lambda record: record.id.seq)
     verified = partial(verify, robot_key.public_key)
     stream = Opener(reader).grant(read_opening(opening, verified))
     assert stream.open(end, verified).kind is Kind.END
