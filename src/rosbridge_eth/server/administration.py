@@ -8,7 +8,8 @@ chain is ordered so that it can be run again after a crash between any two.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,7 +17,7 @@ from urllib.parse import urlsplit
 
 from rosbridge_eth.bundle import Bundle, seal_bundle
 from rosbridge_eth.config import ServerConfig, load_server_config
-from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.errors import ConfigError, IdentityError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome, ReaderHome, write_atomically
 from rosbridge_eth.identity import (
     CertificateAuthority,
@@ -39,9 +40,13 @@ from rosbridge_eth.ledger.journal import Binding
 from rosbridge_eth.reading import join_certificates
 from rosbridge_eth.records import robot_id
 from rosbridge_eth.registry import Enrolment, Registry
+from rosbridge_eth.server.assembly import open_inbox, open_journal
+from rosbridge_eth.server.worker import LOOK_AT_LIST
 from smcrypto import InvalidKey, sm2, x509
 
 OWNER = "owner"
+HANDING_OVER = 2 * LOOK_AT_LIST  # seconds after which no session of a name out of force is left
+SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
 _WEI = 10**18
 
 
@@ -188,12 +193,16 @@ def register_robot(
     now: datetime,
     replace: bool = False,
     requests: tuple[x509.CertificateSigningRequest, x509.CertificateSigningRequest] | None = None,
+    clock: Callable[[], float] = time.time,
+    pause: Callable[[float], None] = time.sleep,
 ) -> Registered:
     """Bind a name to certificates and an account, on the chain and in the registry, and write the bundle.
 
     requests: the robot's own certificate requests (signing, encryption); its
     keys never come here then. The chain comes before the registry: a crash in
-    between leaves a registration that `replace` replaces.
+    between leaves a registration that `replace` replaces. A robot that is
+    replaced ends first, and what it handed over is written under its own name:
+    later it would be a revoked identity's. clock, pause: the wall clock, to wait for that.
     """
     config, deployment = load_server_config(home.config), home.deployment()
     contract = Contract.at(chain, deployment.contract)
@@ -215,7 +224,12 @@ def register_robot(
                 "ca.crt.pem": ca.certificate.to_pem(),
             }
         certificates = join_certificates(peer.signing_certificate.to_der(), peer.encryption_certificate.to_der())
-        known = contract.robot(robot_id(name)).registered
+        before = contract.robot(robot_id(name))
+        if replace and before.may_write:
+            if registry.find(Role.ROBOT, name) is not None:
+                registry.revoke(Role.ROBOT, name, now)
+            _await_handed_over(home, config, name, clock, pause)
+        known = before.registered
         if known and not replace:
             raise IdentityError(
                 f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
@@ -238,6 +252,29 @@ def register_robot(
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, seal_bundle(bundle, password), mode=0o600)
     return Registered(name, account, receipt.block_number, path)
+
+
+def _await_handed_over(
+    home: OperatorHome, config: ServerConfig, name: str, clock: Callable[[], float], pause: Callable[[float], None]
+) -> None:
+    """Wait until everything that a robot out of force handed to the server is confirmed; StoreError if it is not."""
+    inbox, journal = open_inbox(config, home), open_journal(home, home.deployment())
+    last = clock() + HANDING_OVER
+    try:
+        while (now := clock()) < last + SUCCESSION:
+            oldest = inbox.statistics(now).oldest_age
+            if now >= last and (oldest is None or now - oldest > last):  # the inbox is taken from in order of arrival
+                waiting = sum(job.count for job in journal.jobs() if job.robot == robot_id(name))
+                if waiting == 0:
+                    return
+            pause(0.2)
+    finally:
+        inbox.close()
+        journal.close()
+    raise StoreError(
+        f"what the old {name!r} handed to the server is not on the chain yet, and would count as written after its end:"
+        f" let the server run and register again, or give those records up with `revoke {name}` first"
+    )
 
 
 def allot(contract: Contract, keys: Keyring, account: str, config: ServerConfig) -> None:

@@ -156,17 +156,21 @@ def submitter_settings(config: ServerConfig) -> Settings:
 
 
 def account_lookup(registry: Registry, keys: Keyring) -> Callable[[bytes], LocalAccount | None]:
-    """For the submitter: the account a robot (Tk) signs with now, None for a name that is not in force."""
+    """For the submitter: the account a robot (Tk) signs with, that of its newest enrolment; None without any.
 
-    in_force: dict[bytes, int] = {}
+    Whether it may write is the contract's to say: what a robot had handed over
+    when it was taken out of force is written until the chain is told.
+    """
+
+    newest: dict[bytes, int] = {}
     revision: tuple[int, int] | None = None
 
     def account_of(robot: bytes) -> LocalAccount | None:
-        nonlocal in_force, revision
+        nonlocal newest, revision
         if (now := registry.revision()) != revision:  # read before the rows: a change in between is read again
-            in_force = {robot_id(e.name): e.number for e in registry.all(Role.ROBOT) if e.revoked_at is None}
+            newest = {robot_id(e.name): e.number for e in registry.all(Role.ROBOT)}
             revision = now
-        number = in_force.get(robot)
+        number = newest.get(robot)
         return None if number is None else keys.robot(number)
 
     return account_of
