@@ -18,10 +18,13 @@ class Restarts:
         self._short: dict[str, int] = {}
         self.total: dict[str, int] = {}
 
-    def ended(self, name: str, exit_code: int | None, lived: float) -> float | None:
-        """Seconds to wait before it is started again; None: it will not come up, give up."""
+    def ended(self, name: str, exit_code: int | None, lived: float, *, vital: bool = True) -> float | None:
+        """Seconds to wait before it is started again; None: it will not come up, give up.
+
+        vital: without it the server is no server; what is not vital is tried for ever.
+        """
         short = self._short[name] = self._short.get(name, 0) + 1 if lived < SHORT_LIFE else 0
-        if short >= GIVE_UP_AFTER and exit_code not in PATIENT:
+        if vital and short >= GIVE_UP_AFTER and exit_code not in PATIENT:
             return None
         self.total[name] = self.total.get(name, 0) + 1
         return float(min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** max(0, short - 1)))

@@ -102,8 +102,10 @@ class Supervisor:
         for worker, sock in enumerate(sockets):
             tasks[worker_name(worker)] = self._worker_task(worker, sock)
         if self._config.monitor is not None:
-            self._wire = Wire()
-            tasks[MONITOR] = self._monitor_task(self._config.monitor, self._wire, list(tasks))
+            self._wire, board = Wire(), Board([*tasks, SUPERVISOR], [NODE, STORE])
+            # Its port is opened here, so that one that is taken is told at the start, before a robot is answered.
+            web = Web(self._config.monitor, board)
+            tasks[MONITOR] = self._monitor_task(self._wire, board, web)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
         try:
@@ -161,7 +163,7 @@ class Supervisor:
             if process.is_alive() or name in self._due:
                 continue
             code, lived = process.exitcode, now - self._started_at[name]
-            pause = self._restarts.ended(name, code, lived)
+            pause = self._restarts.ended(name, code, lived, vital=name != MONITOR)
             if pause is None:
                 raise ProcessError(
                     f"{name} ends with exit code {code} as soon as it is started; the log says why."
@@ -244,7 +246,7 @@ class Supervisor:
 
         submission.run(stopped, on_turn=publish)
 
-    def _monitor_task(self, address: tuple[str, int], wire: Wire, expected: list[str]) -> Callable[[], None]:
+    def _monitor_task(self, wire: Wire, board: Board, web: Web) -> Callable[[], None]:
         def watch() -> None:
             chain, registry = open_chain(self._config), Registry(self._home.registry)
             treasury = self._secrets.keys.operator.address
@@ -254,11 +256,10 @@ class Supervisor:
                           if robot.account is not None and robot.revoked_at is None]
                 return [(treasury, "operator"), *robots]
 
-            board = Board([*expected, SUPERVISOR], [NODE, STORE])
             Monitor(
                 wire,
                 board,
-                Web(address, board),
+                web,
                 NodeWatch(chain, lambda: bound_contract(chain, self._deployment), accounts),
                 StoreWatch(
                     open_inbox(self._config, self._home), open_journal(self._home, self._deployment), self._home.path

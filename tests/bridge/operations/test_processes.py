@@ -205,7 +205,7 @@ def test_a_node_that_is_away_makes_it_unready_but_not_unhealthy(bridge: Bridge):
 
 
 def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bridge):
-    bridge.anvil.stop()
+    bridge.anvil.kill()  # what it wrote at its last end is all there is: nothing was written since
     before = bridge.figures()["process_restarts_total"]
     pids = [str(event["event"]).rpartition(" ")[2] for event in bridge.events("server.log")
             if str(event["event"]).startswith("submitter started")]
@@ -220,3 +220,13 @@ def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Br
     bridge.server.terminate()
     assert bridge.server.wait(30) == ExitCode.OK
     assert all({"time", "level", "part", "process", "event"} <= event.keys() for event in bridge.events("server.log"))
+
+
+def test_a_monitor_whose_port_is_taken_is_told_at_the_start(bridge: Bridge):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", bridge.monitor))
+        taken.listen()
+        done = subprocess.run(bridge.command("server", "--passphrase-file", "pass"), cwd=bridge.path, text=True,
+                              env=bridge.environment, capture_output=True, timeout=60, check=False)
+    assert done.returncode == ExitCode.NETWORK
+    assert "correct `monitor`" in done.stderr and "Traceback" not in done.stderr

@@ -43,3 +43,9 @@ def test_a_node_that_is_away_is_waited_for_however_long():
     pauses = [restarts.ended("submitter", ExitCode.CHAIN, 0.1) for _ in range(100)]
     assert None not in pauses
     assert pauses[-1] == LONGEST_PAUSE
+
+
+def test_what_is_not_vital_is_tried_for_ever():
+    restarts = Restarts()
+    pauses = [restarts.ended("monitor", 1, 0.1, vital=False) for _ in range(100)]
+    assert None not in pauses and pauses[-1] == LONGEST_PAUSE
