@@ -32,7 +32,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -370,7 +369,7 @@ class Site:
     def revoke(self, name: str) -> None:
         self.command("revoke", name, *self._passphrase)
 
-    def run_robot(self, home: Path, log: Path, **environment: str) -> Program:
+    def run_robot(self, home: Path, log: Path, environment: Mapping[str, str]) -> Program:
         return Program(log, ["robot", "--home", str(home), "--password-file", str(self._secret), "--verbose"],
                        environment)
 
@@ -469,10 +468,10 @@ class Flow:
 
     # Lives.
 
-    def start(self, home: Path | None = None, **environment: str) -> Program:
+    def start(self, home: Path | None = None, environment: Mapping[str, str] | None = None) -> Program:
         """The robot begins to replay the bag; returns when its session stands."""
         place = home or self.home
-        program = self.site.run_robot(place, self.site.folder / f"{place.name}.log", **environment)
+        program = self.site.run_robot(place, self.site.folder / f"{place.name}.log", environment or {})
         self.program = program
         until("the robot is connected", lambda: "connected to" in program.said or program.ended())
         assert not program.ended(), program.said[-2000:]
@@ -724,14 +723,22 @@ def fill_up(folder: Path) -> Path:
 
 
 def full_disk_of_robot(site: Site, seed: int) -> Count:
-    """The disk of the robot's spool is full for a while."""
+    """The disk of the robot's spool is full for a while, and the server does not answer: what is new can go nowhere."""
     with small_disk(site.folder / f"disk-{seed}-{site.robots}", "2m") as disk:
         flow = Flow(site, "robot's disk full", seed, home=disk / "robot")
         program = flow.start()
-        flow.pause(0.1, 0.4)
-        ballast = fill_up(disk)
-        flow.event("the disk of the spool is full")
-        flow.pause(0.3, 0.5)
+        flow.pause(0.05, 0.3)
+        workers = [site.child("worker-0"), site.child("worker-1")]
+        for pid in workers:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            ballast = fill_up(disk)
+            flow.event("the disk of the spool is full, and the server does not answer")
+            flow.pause(0.3, 0.5)
+        finally:
+            for pid in workers:
+                os.kill(pid, signal.SIGCONT)
+        flow.pause(0.1, 0.3)
         ballast.unlink()
         flow.finish(program)
         return flow.audit()
@@ -768,7 +775,7 @@ def clock_jumps(site: Site, seed: int) -> Count:
     site.restart_server(**fake)
     try:
         flow = Flow(site, "clock jumps", seed)
-        flow.start(**fake)
+        flow.start(environment=fake)
         for jump in flow.random.sample([86_400, -7200, 3600, -600], 2):
             flow.pause(0.1, 0.4)
             offset.write_text(str(jump))
@@ -810,7 +817,11 @@ def twins(site: Site, seed: int) -> Count:
     flow.event("a second robot with the same keys")
     flow.finish(first)
     flow.finish(second, double)
-    return flow.audit()
+    count = flow.audit()
+    told = {found.kind for found in site.read(flow.name).proven.findings}
+    if FindingKind.RESTARTED not in told:
+        count.findings.append("the reader is not told that the second stream knows nothing of the first")
+    return count
 
 
 FAULTS: dict[str, Callable[[Site, int], Count]] = {
@@ -848,7 +859,7 @@ def open_site(folder: Path, *, redis: bool = False) -> Iterator[Site]:
 def table(counts: Sequence[Count]) -> str:
     heads = ["fault", "times", "lives", "sealed", "acked", "on chain", "doubled", "altered", "missing", "declared",
              "restarts", "sessions", "resent", "dup.", "s"]
-    rows = [
+    rows: list[list[str | int]] = [
         [c.fault, c.injected, c.lives, c.sealed, c.acknowledged, c.on_chain, c.doubled, c.altered, c.missing,
          c.declared, c.restarts, c.sessions, c.retransmitted, c.duplicates, f"{c.seconds:.0f}"] for c in counts
     ]
