@@ -52,6 +52,7 @@ class RedisServer:
                         break
                     except subprocess.TimeoutExpired:
                         continue
+        self.kill()
         raise RuntimeError((self.folder / "redis.log").read_text())
 
     def client(self, **more) -> redis.Redis:
