@@ -237,6 +237,7 @@ class Site:
         self.node: Program | None = None
         self.server: Program | None = None
         self.robots = 0
+        self._lives: list[Program] = []
         try:
             self._set_up(redis)
         except BaseException:
@@ -267,7 +268,7 @@ class Site:
         return program.said
 
     def close(self) -> None:
-        for program in (self.server, self.node):
+        for program in (*self._lives, self.server, self.node):
             if program is not None and not program.ended():
                 for pid in family(program.pid):
                     kill(pid)
@@ -370,8 +371,9 @@ class Site:
         self.command("revoke", name, *self._passphrase)
 
     def run_robot(self, home: Path, log: Path, environment: Mapping[str, str]) -> Program:
-        return Program(log, ["robot", "--home", str(home), "--password-file", str(self._secret), "--verbose"],
-                       environment)
+        arguments = ["robot", "--home", str(home), "--password-file", str(self._secret), "--verbose"]
+        self._lives.append(Program(log, arguments, environment))
+        return self._lives[-1]
 
     # What became of the records.
 
