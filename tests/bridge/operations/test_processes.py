@@ -224,6 +224,7 @@ def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Br
 
 def test_a_monitor_whose_port_is_taken_is_told_at_the_start(bridge: Bridge):
     with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before linger
         taken.bind(("127.0.0.1", bridge.monitor))
         taken.listen()
         done = subprocess.run(bridge.command("server", "--passphrase-file", "pass"), cwd=bridge.path, text=True,
