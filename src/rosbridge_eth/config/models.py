@@ -460,9 +460,6 @@ class ChainConfig(Section):
         description='JSON-RPC URL of a node, or `"embedded"`: an EVM in the process, for trying out; it ends with it.',
         repr=False,
     )
-    contract: ContractAddress | None = Field(
-        default=None, description="The contract; without it, the one that `deploy` made."
-    )
     confirmations: int = Field(
         default=1, ge=1, le=10_000, description="Blocks, its own included, after which a transaction is confirmed."
     )
@@ -555,7 +552,6 @@ class ReaderConfig(Section):
         default="http://127.0.0.1:8545", description="JSON-RPC URL of any node of the chain.", repr=False
     )
     from_block: int = Field(default=0, ge=0, description="The block of the contract's deployment, or later.")
-    block_range: int = Field(default=1000, ge=1, le=100_000, description="Blocks asked for at once.")
 
 
 ROOTS: tuple[type[Section], ...] = (RobotConfig, ServerConfig, ReaderConfig)

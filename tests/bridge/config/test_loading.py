@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
+from rosbridge_eth import config as config_package
 from rosbridge_eth.capture import TopicRule
 from rosbridge_eth.config import (
     ReaderConfig,
@@ -175,7 +178,7 @@ def test_a_mistake_in_robot_toml_is_told(text):
         ("workers = 0", "line 1: workers is 0; it should be at least 1"),
         ("channel = []", "line 1: channel is empty"),
         ('channel = ["foo"]', "line 1: channel[0] is 'foo'; allowed: 'exchange', 'transport'"),
-        ('[chain]\ncontract = "0x12"', "chain.contract is '0x12'; an address is 0x and 40 hexadecimal digits"),
+        ('[chain]\ncontract = "0x12"', "unknown key 'contract' in chain; allowed: "),
         ("[chain]\nconfirmations = true", "chain.confirmations is true; it should be a whole number"),
         ('[chain]\npoll = "2h"', "chain.poll is '2h'; it should be at most '1m'"),
         ("[batch]\nsize = 10", "batch.size is 10; it should be at least 33792"),
@@ -216,6 +219,29 @@ def test_the_line_of_a_repeated_table_is_found():
 def test_a_reader_needs_contract_ca_and_identity():
     with pytest.raises(ConfigError, match="contract is missing; ca is missing; identity is missing"):
         parse_config(ReaderConfig, "", Path("reader.toml"))
+
+
+def test_an_address_that_is_none_is_told():
+    with pytest.raises(ConfigError, match="contract is '0x12'; an address is 0x and 40 hexadecimal digits"):
+        parse_config(ReaderConfig, 'contract = "0x12"', Path("reader.toml"))
+
+
+def sections(root):
+    found = [root]
+    for field in root.model_fields.values():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            found += sections(field.annotation)
+    return found
+
+
+@pytest.mark.parametrize("root", [ServerConfig, ReaderConfig])
+def test_every_key_has_an_effect(root):
+    """A key that nothing reads is a promise to the operator that is not kept."""
+    package = Path(config_package.__file__).parent
+    program = "".join(path.read_text() for path in package.parent.rglob("*.py") if path.parent != package)
+    unread = [(section.__name__, name) for section in sections(root) for name in section.model_fields
+              if not re.search(rf"\.{name}\b", program)]
+    assert unread == []
 
 
 def test_files_that_cannot_be_read(tmp_path):
