@@ -197,6 +197,7 @@ def run_demo(
     try:
         with _timed(stages, "replay and delivery"):
             robot.run(on_turn=lambda: _progress(robot, server, stages, on_progress))
+            _progress(robot, server, stages, on_progress)
         on_stage("waiting for the last block")
         with _timed(stages, "last batches"):
             _settle(server, stages, on_progress)

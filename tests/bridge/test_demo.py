@@ -8,11 +8,14 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rosbridge_eth import demo
 from rosbridge_eth.capture import CapturedRecord
 from rosbridge_eth.demo import DemoResult, compare, run_demo
+from rosbridge_eth.robot.process import Robot
 from rosbridge_eth.sources.sample import sample_bag
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,6 +67,21 @@ def test_an_altered_field_is_told_by_its_path(result: DemoResult) -> None:
 
 def test_an_incomplete_result_does_not_pass(result: DemoResult) -> None:
     assert not replace(result, records=result.records[:-1]).passed
+
+
+def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    progress = demo._progress
+
+    def stop_early(robot: Robot, *others: Any) -> None:
+        progress(robot, *others)
+        if robot.recorder.times.records >= 100:
+            robot.stop()  # at the end once more, as a signal may come when all is done
+
+    monkeypatch.setattr(demo, "_progress", stop_early)
+    stopped = run_demo(tmp_path, sample_bag())
+    assert 100 <= len(stopped.records) < 300
+    assert stopped.reading.complete  # nothing after the last record can have been withheld
+    assert not stopped.passed
 
 
 @pytest.mark.slow

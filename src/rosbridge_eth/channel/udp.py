@@ -180,7 +180,9 @@ class UdpLoop:
         self.wake()
 
     def wake(self) -> None:
-        """Make a waiting `step` return, from any thread or a signal handler."""
+        """Make a waiting `step` return, from any thread or a signal handler; nothing happens once it is closed."""
+        if self._wake_send.fileno() < 0:
+            return
         try:
             self._wake_send.send(b"\0")
         except BlockingIOError:

@@ -25,6 +25,7 @@ RING = 1024  # raw messages between the source's thread and the loop
 TAKE = 32  # raw messages sealed before the network gets its turn again
 LONGEST_WAIT = 0.25
 SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
+LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
 CLOSING_TIME = 1.0  # seconds for the server to learn that the robot leaves
 
 
@@ -90,6 +91,7 @@ class Robot:
                 self.loop.step(self._wait(now))
             else:
                 self.recorder.finish(wall_ns=time.time_ns(), now=time.monotonic())
+                self._say_the_end()
         finally:
             self._stop.set()
             self._leave()
@@ -142,6 +144,17 @@ class Robot:
             return 0.0
         timers = (self.spool.next_commit(), self.sender.next_timer())
         return max(0.0, min([LONGEST_WAIT, *(timer - now for timer in timers if timer is not None)]))
+
+    def _say_the_end(self) -> None:
+        """After `stop`: bring what is left and the stream's end to the server, if that takes no longer than a moment.
+
+        Otherwise it waits in the spool: the next run sends it.
+        """
+        deadline = time.monotonic() + LAST_WORDS_TIME
+        while self.sender.statistics.connected and not self.sender.idle and (now := time.monotonic()) < deadline:
+            self.spool.commit(now)
+            self.sender.send(now)
+            self.loop.step(0.02)
 
     def _leave(self) -> None:
         """End the session in good order, so that the server need not wait for a silent robot."""

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cache
-from hmac import compare_digest
 from typing import Literal, TypeAlias
 
-from smcrypto.errors import InvalidKey, InvalidLength, InvalidOption
+from smcrypto.errors import InvalidLength, InvalidOption
 from smcrypto.sm4.engine import Engine, xor_bytes
 
 __all__ = ["Variant", "XTSStream", "check_variant", "tweak_sequence"]
@@ -72,14 +71,12 @@ def tweak_sequence(first: bytes, n: int, variant: Variant) -> bytes:
 class XTSStream:
     """One data unit in one direction; keeps 16 to 31 bytes back, which the stealing may need.
 
-    Equal halves of the key are refused for encryption: with them, a chosen
-    plaintext reveals tweaks (FIPS 140-3 IG C.I). Decryption takes them, so
-    that what others wrote stays readable; OpenSSL does the same.
+    Equal halves of the key are taken, as GB/T 17964 does: a key drawn at random
+    never has them. With them a chosen plaintext reveals tweaks, and FIPS 140-3
+    (IG C.I) forbids them.
     """
 
     def __init__(self, key: bytes, tweak: bytes, variant: Variant, *, encrypting: bool) -> None:
-        if encrypting and compare_digest(key[:16], key[16:]):
-            raise InvalidKey("the two halves of an XTS key must differ")
         engine = Engine(key[:16])
         self._crypt = engine.encrypt if encrypting else engine.decrypt
         self._encrypting, self._variant = encrypting, variant
