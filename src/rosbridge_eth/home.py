@@ -180,7 +180,8 @@ class RobotHome:
         try:
             return BridgeEnd(**json.loads(self.bridge_file.read_bytes()))
         except FileNotFoundError:
-            raise ConfigError(f"{self.path} is not a robot's home; run `join BUNDLE --home {self.path}` first") from None
+            text = f"{self.path} is not a robot's home; run `join BUNDLE --home {self.path}` first"
+            raise ConfigError(text) from None
         except (ValueError, TypeError) as error:
             raise ConfigError(f"{self.bridge_file} is damaged ({error}); join again") from error
 

@@ -13,6 +13,7 @@ are doubles (JavaScript) has to parse them as big integers.
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -22,6 +23,9 @@ from rosbridge_eth.errors import VerificationError
 Delivery: TypeAlias = Literal["reliable", "latest"]
 DELIVERIES: tuple[Delivery, ...] = get_args(Delivery)
 VERSION = 1
+MAX_DEPTH = 100
+"""Levels of nesting of a record's JSON; definitions of messages are nested less (capture.definitions)."""
+_STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*"')
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,8 @@ class CapturedRecord:
     @classmethod
     def from_json(cls, encoded: bytes) -> CapturedRecord:
         """The record again, or VerificationError: whoever signed it did not write it by these rules."""
+        if _depth(encoded) > MAX_DEPTH:
+            raise VerificationError(f"a record's content is nested more than {MAX_DEPTH} deep")
         try:
             value = json.loads(encoded.decode(), parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
@@ -96,6 +102,24 @@ class CapturedRecord:
         if not canonical:
             raise VerificationError("a record's content is not in its one form: no white space, members in order")
         return record
+
+
+def _depth(encoded: bytes) -> int:
+    """How deep brackets are nested outside strings; 0 where there are too few of them to matter.
+
+    Before parsing: Python's JSON parser stops at the recursion limit, which a library may have raised until
+    the C stack ends first.
+    """
+    if encoded.count(b"[") + encoded.count(b"{") <= MAX_DEPTH:
+        return 0
+    depth = deepest = 0
+    for byte in _STRINGS.sub(b"", encoded):
+        if byte in b"[{":
+            depth += 1
+            deepest = max(deepest, depth)
+        elif byte in b"]}":
+            depth -= 1
+    return deepest
 
 
 _MEMBERS: dict[str, type] = {

@@ -71,8 +71,8 @@ def tweak_sequence(first: bytes, n: int, variant: Variant) -> bytes:
 class XTSStream:
     """One data unit in one direction; keeps 16 to 31 bytes back, which the stealing may need.
 
-    Equal halves of the key are taken, as GB/T 17964 does: a key drawn at random
-    never has them. With them a chosen plaintext reveals tweaks, and FIPS 140-3
+    Equal halves of the key are taken, as vectors of GB/T 17964 have them; a key
+    drawn at random never does. With them a chosen plaintext reveals tweaks, and FIPS 140-3
     (IG C.I) forbids them.
     """
 

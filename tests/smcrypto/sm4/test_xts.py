@@ -56,11 +56,7 @@ def test_vectors(v: SimpleNamespace) -> None:
     for variant in {"GB": ["gb"], "IEEE": ["ieee"], "both": VARIANTS}[v.standard]:
         mode = sm4.XTS(v.tweak, variant=variant)
         assert sm4.decrypt(v.key, mode, v.ciphertext) == v.plaintext
-        if v.key[:16] == v.key[16:]:
-            with pytest.raises(smcrypto.InvalidKey):
-                sm4.encrypt(v.key, mode, v.plaintext)
-        else:
-            assert sm4.encrypt(v.key, mode, v.plaintext) == v.ciphertext
+        assert sm4.encrypt(v.key, mode, v.plaintext) == v.ciphertext
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
