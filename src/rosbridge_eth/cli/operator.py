@@ -188,10 +188,12 @@ def revoke(
     keys = Keyring.load(place.accounts, _passphrase(passphrase_file))
     node = open_chain(load_server_config(place.config))
     try:
-        block = revoke_name(place, role, name, keys=keys, chain=node, now=_now())
+        ended = revoke_name(place, role, name, keys=keys, chain=node, now=_now())
     finally:
         node.close()
-    talk(f"{role} {name} is revoked" + (f", on the chain in block {block}." if block is not None else "."))
+    talk(f"{role} {name} is revoked" + (f", on the chain in block {ended.block}." if ended.block is not None else "."))
+    if not ended.all_written:
+        talk("The server has records of it that were not on the chain in time; they stay in its journal, see `status`.")
 
 
 def renew(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:

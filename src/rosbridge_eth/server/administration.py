@@ -47,6 +47,7 @@ from smcrypto import InvalidKey, sm2, x509
 OWNER = "owner"
 HANDING_OVER = 2 * LOOK_AT_LIST  # seconds after which no session of a name out of force is left
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
+LAST_WRITES = 20.0  # the same, where a robot is revoked and not replaced: then its right ends all the same
 _WEI = 10**18
 
 
@@ -228,7 +229,12 @@ def register_robot(
         if replace and before.may_write:
             if registry.find(Role.ROBOT, name) is not None:
                 registry.revoke(Role.ROBOT, name, now)
-            _await_handed_over(home, config, name, clock, pause)
+            if not _handed_over_is_written(home, config, name, SUCCESSION, clock, pause):
+                raise StoreError(
+                    f"what the old {name!r} handed to the server is not on the chain yet, and would count as written"
+                    " after its end: let the server run and register again, or give those records up with"
+                    f" `revoke {name}` first"
+                )
         known = before.registered
         if known and not replace:
             raise IdentityError(
@@ -254,27 +260,29 @@ def register_robot(
     return Registered(name, account, receipt.block_number, path)
 
 
-def _await_handed_over(
-    home: OperatorHome, config: ServerConfig, name: str, clock: Callable[[], float], pause: Callable[[float], None]
-) -> None:
-    """Wait until everything that a robot out of force handed to the server is confirmed; StoreError if it is not."""
+def _handed_over_is_written(
+    home: OperatorHome,
+    config: ServerConfig,
+    name: str,
+    patience: float,
+    clock: Callable[[], float],
+    pause: Callable[[float], None],
+) -> bool:
+    """Wait until everything that a robot out of force handed to the server is confirmed; False if it takes too long."""
     inbox, journal = open_inbox(config, home), open_journal(home, home.deployment())
     last = clock() + HANDING_OVER
     try:
-        while (now := clock()) < last + SUCCESSION:
+        while (now := clock()) < last + patience:
             oldest = inbox.statistics(now).oldest_age
             if now >= last and (oldest is None or now - oldest > last):  # the inbox is taken from in order of arrival
                 waiting = sum(job.count for job in journal.jobs() if job.robot == robot_id(name))
                 if waiting == 0:
-                    return
+                    return True
             pause(0.2)
     finally:
         inbox.close()
         journal.close()
-    raise StoreError(
-        f"what the old {name!r} handed to the server is not on the chain yet, and would count as written after its end:"
-        f" let the server run and register again, or give those records up with `revoke {name}` first"
-    )
+    return False
 
 
 def allot(contract: Contract, keys: Keyring, account: str, config: ServerConfig) -> None:
@@ -327,10 +335,32 @@ def write_reader_toml(home: OperatorHome, name: str) -> None:
     )
 
 
-def revoke(home: OperatorHome, role: Role, name: str, *, keys: Keyring, chain: Chain, now: datetime) -> int | None:
-    """Take a name out of force: the server closes its session, the contract its right to write (the block of that).
+@dataclass(frozen=True, slots=True)
+class Revoked:
+    """block: where the contract ended a robot's right to write; None for others, and where it had none.
 
-    The registry comes first: from then on the server refuses the name, whatever the chain does.
+    all_written: False if the server had records of it that are not on the chain and now never will be.
+    """
+
+    block: int | None
+    all_written: bool = True
+
+
+def revoke(
+    home: OperatorHome,
+    role: Role,
+    name: str,
+    *,
+    keys: Keyring,
+    chain: Chain,
+    now: datetime,
+    clock: Callable[[], float] = time.time,
+    pause: Callable[[float], None] = time.sleep,
+) -> Revoked:
+    """Take a name out of force: the server closes its session at once, the contract ends its right to write.
+
+    The registry comes first: from then on the server refuses the name, whatever the chain does. What the server
+    acknowledged before is given LAST_WRITES seconds to be written; clock, pause: the wall clock, to wait for that.
     """
     registry = Registry(home.registry)
     try:
@@ -342,13 +372,14 @@ def revoke(home: OperatorHome, role: Role, name: str, *, keys: Keyring, chain: C
     finally:
         registry.close()
     if role is not Role.ROBOT:
-        return None
+        return Revoked(None)
     contract = Contract.at(chain, home.deployment().contract)
     if not contract.robot(robot_id(name)).may_write:
         if in_force is None:
             raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
-        return None
-    return contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number
+        return Revoked(None)
+    all_written = _handed_over_is_written(home, load_server_config(home.config), name, LAST_WRITES, clock, pause)
+    return Revoked(contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number, all_written)
 
 
 def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime) -> Path:

@@ -21,6 +21,7 @@ from rosbridge_eth.records import RecordId, SealedRecord, robot_id
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.server.administration import (
     Registered,
+    Revoked,
     deploy_contract,
     init_home,
     load_ca,
@@ -58,6 +59,10 @@ class World:
             self.home, "robot_1", ca=load_ca(self.home, PASSPHRASE), keys=self.keys, chain=self.chain,
             password=b"robot's", now=NOW, replace=replace, clock=lambda: self.now, pause=pause,
         )
+
+    def revoke(self, pause: Callable[[float], None]) -> Revoked:
+        return revoke(self.home, Role.ROBOT, "robot_1", keys=self.keys, chain=self.chain, now=NOW,
+                      clock=lambda: self.now, pause=pause)
 
     def hand_over(self, first: int, count: int) -> None:
         seqs = range(first, first + count)
@@ -109,9 +114,26 @@ def test_without_a_server_the_robot_is_not_replaced_and_the_way_out_is_told(worl
 
 def test_a_robot_revoked_on_the_chain_is_replaced_without_waiting(world: World) -> None:
     old = world.register()
-    revoke(world.home, Role.ROBOT, "robot_1", keys=world.keys, chain=world.chain, now=NOW)
+    assert world.revoke(world.wait).all_written
 
     def never(seconds: float) -> None:
         pytest.fail("there is nothing to wait for")
 
     assert world.register(never, replace=True).account != old.account
+
+
+def test_what_a_revoked_robot_handed_over_is_written_before_its_right_ends(world: World) -> None:
+    account = world.register().account
+    world.hand_over(0, 5)
+    ended = world.revoke(world.serve)
+    assert ended.all_written and ended.block is not None
+    assert world.written() == dict.fromkeys(range(5), account)
+    assert not world.contract.robot(TK).may_write
+
+
+def test_without_a_server_a_robot_is_revoked_all_the_same_and_what_is_not_written_is_told(world: World) -> None:
+    world.register()
+    world.hand_over(0, 5)
+    assert not world.revoke(world.wait).all_written
+    assert not world.contract.robot(TK).may_write
+    assert world.written() == {}
