@@ -205,6 +205,7 @@ def test_a_node_that_is_away_makes_it_unready_but_not_unhealthy(bridge: Bridge):
 
 
 def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bridge):
+    bridge.until("ready at first", bridge.ready)
     bridge.anvil.kill()  # what it wrote at its last end is all there is: nothing was written since
     before = bridge.figures()["process_restarts_total"]
     pids = [str(event["event"]).rpartition(" ")[2] for event in bridge.events("server.log")
@@ -217,6 +218,7 @@ def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bri
 
 def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Bridge):
     assert bridge.server is not None
+    bridge.until("ready at first", bridge.ready)
     bridge.server.terminate()
     assert bridge.server.wait(30) == ExitCode.OK
     assert all({"time", "level", "part", "process", "event"} <= event.keys() for event in bridge.events("server.log"))
