@@ -285,15 +285,16 @@ def check(
     proven: bool | None = None
     if found.block is not None:
         node = open_chain(config)
-        contract = Contract.at(node, deployment.contract)
-        for item in ledger.fetch(node, contract, id.robot, found.block, found.block).records:
-            if item.record.id == id:
-                batch = [other for other in ledger.fetch(node, contract, id.robot, found.block, found.block).records
-                         if other.batch_index == item.batch_index]
-                leaves = [merkle.leaf_hash(other.record) for other in batch]
-                path = merkle.proof(leaves, item.leaf)
-                proven = contract.check_data(item.record, item.batch_index, item.leaf, item.leaves, path)
-        node.close()
+        try:
+            contract = Contract.at(node, deployment.contract)
+            records = ledger.fetch(node, contract, id.robot, found.block, found.block).records
+            for item in records:
+                if item.record.id == id:
+                    batch = [other.record for other in records if other.batch_index == item.batch_index]
+                    path = merkle.proof([merkle.leaf_hash(record) for record in batch], item.leaf)
+                    proven = contract.check_data(item.record, item.batch_index, item.leaf, item.leaves, path)
+        finally:
+            node.close()
     if json:
         print_json({"state": found.state, "transaction": found.transaction, "block": found.block, "proven": proven})
     else:

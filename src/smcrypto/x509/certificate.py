@@ -60,9 +60,7 @@ class Certificate:
     def _read(self, data: bytes) -> None:
         self._der = data
         self._signed = read_signed(data)
-        outer = der.Reader(self._signed.body)
-        body = outer.sequence()
-        outer.finish()
+        body = self._signed.fields()
         self._version = _read_version(body)
         self._serial_number = body.integer()
         if body.raw() != self._signed.algorithm:

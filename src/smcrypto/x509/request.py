@@ -81,9 +81,7 @@ class CertificateSigningRequest:
         self._der = data
         self._verified = False
         self._signed: Signed = read_signed(data)
-        outer = der.Reader(self._signed.body)
-        body = outer.sequence()
-        outer.finish()
+        body = self._signed.fields()
         version = body.integer()
         if version != 0:
             raise CertificateError(f"request version {version}")

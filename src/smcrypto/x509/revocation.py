@@ -138,9 +138,7 @@ class CertificateRevocationList:
     def _read(self, data: bytes) -> None:
         self._der = data
         self._signed = read_signed(data)
-        outer = der.Reader(self._signed.body)
-        body = outer.sequence()
-        outer.finish()
+        body = self._signed.fields()
         version_2 = body.peek_tag() == der.INTEGER
         if version_2 and body.integer() != 1:
             raise CertificateError("a revocation list of a version other than 1 and 2")

@@ -51,6 +51,13 @@ class Signed(NamedTuple):
     algorithm: bytes
     signature: bytes
 
+    def fields(self) -> der.Reader:
+        """A reader of what the body, one SEQUENCE, holds."""
+        outer = der.Reader(self.body)
+        body = outer.sequence()
+        outer.finish()
+        return body
+
     def verify(self, public_key: sm2.PublicKey, uid: bytes, what: str) -> None:
         if self.algorithm not in _ACCEPTED:
             raise CertificateError(f"{what} is not signed with SM2-with-SM3, the only algorithm supported")
