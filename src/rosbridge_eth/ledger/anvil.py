@@ -6,6 +6,7 @@ the chain survives a restart: anvil writes it every few seconds, and when it is 
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -84,6 +85,32 @@ def _require_free(port: int) -> None:
             raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another one") from error
 
 
+def keep_one_genesis(state: Path) -> None:
+    """Leave a state file of anvil with the first block that its chain began with.
+
+    A restarted anvil makes a first block of its own before it reads the file, and later writes both; the start after
+    that takes either, and so may come back as another chain. Each is as old as its start: the oldest is the chain's.
+    ChainError if the file was cut off, as when anvil was killed while it wrote.
+    """
+    try:
+        content = json.loads(state.read_bytes())
+        first = [block for block in content["blocks"] if int(block["header"]["number"], 16) == 0]
+        ages = [int(block["header"]["timestamp"], 16) for block in first]
+    except FileNotFoundError:
+        return
+    except (ValueError, KeyError, TypeError) as error:
+        raise ChainError(
+            f"{state} is not whole, anvil was killed while it wrote it; put back a copy of the file, "
+            "or move it away to begin a new chain with a new home"
+        ) from error
+    if len(first) > 1:
+        genesis = first[ages.index(min(ages))]
+        content["blocks"] = [block for block in content["blocks"] if block is genesis or block not in first]
+        whole = state.with_name(state.name + ".new")
+        whole.write_text(json.dumps(content))
+        whole.replace(state)
+
+
 def start(
     port: int,
     *,
@@ -96,9 +123,11 @@ def start(
 
     state: the file that keeps the chain. block_time: seconds between blocks; without it
     every transaction gets its block at once. log: where its output goes (nowhere otherwise).
-    ChainError if npx is missing, the port is taken or it does not start.
+    ChainError if npx is missing, the port is taken, the state is not whole or it does not start.
     """
     _require_free(port)
+    if state is not None:
+        keep_one_genesis(state)
     program = shutil.which("anvil")
     npx = shutil.which("npx")
     if program:

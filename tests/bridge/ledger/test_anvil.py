@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import signal
 import socket
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -204,6 +206,28 @@ def test_a_node_that_is_killed_and_comes_back_with_its_state(records: Records, t
         check(contract, given + more)
         Journal(tmp_path / "journal", Binding.of(Contract.at(chain, contract.address))).close()  # still the same chain
         process.journal.close()
+
+
+def test_a_chain_stays_the_same_however_often_its_node_is_started(tmp_path: Path):
+    port, state = free_port(), tmp_path / "state.json"
+    genesis = set()
+    for _ in range(4):
+        with start(port, state=state) as running:
+            chain = JsonRpcChain(running.url)
+            genesis.add(chain.request("eth_getBlockByNumber", "0x0", False)["hash"])
+            chain.request("anvil_mine", "0x2")
+            chain.close()
+        blocks = [int(block["header"]["number"], 16) for block in json.loads(state.read_bytes())["blocks"]]
+        assert set(blocks) == set(range(max(blocks) + 1))
+        time.sleep(1.1)  # the next start's own first block is of another second
+    assert len(genesis) == 1
+    assert blocks.count(0) == 2, "anvil no longer writes the first block of every start: keep_one_genesis can go"
+
+
+def test_a_state_file_that_was_cut_off_is_said(tmp_path: Path):
+    (state := tmp_path / "chain.json").write_text('{"blocks": [{"head')
+    with pytest.raises(ChainError, match="not whole"):
+        anvil.start(free_port(), state=state)
 
 
 def test_a_port_in_use_is_said(node: anvil.Anvil):
