@@ -865,7 +865,7 @@ def open_site(folder: Path, *, redis: bool = False) -> Iterator[Site]:
         raise Unavailable("neither 'anvil' nor 'npx' is installed")
     with ExitStack() as stack:
         try:
-            disk = stack.enter_context(small_disk(folder / "server-disk", "24m"))
+            disk = stack.enter_context(small_disk(folder / "server-disk", "64m"))
         except Unavailable:
             disk = folder / "no-disk"
             disk.mkdir()

@@ -90,7 +90,7 @@ def keep_one_genesis(state: Path) -> None:
 
     A restarted anvil makes a first block of its own before it reads the file, and later writes both; the start after
     that takes either, and so may come back as another chain. Each is as old as its start: the oldest is the chain's.
-    ChainError if the file was cut off, as when anvil was killed while it wrote.
+    ChainError if the file was cut off, as when anvil was killed while it wrote, or cannot be put right.
     """
     try:
         content = json.loads(state.read_bytes())
@@ -107,8 +107,12 @@ def keep_one_genesis(state: Path) -> None:
         genesis = first[ages.index(min(ages))]
         content["blocks"] = [block for block in content["blocks"] if block is genesis or block not in first]
         whole = state.with_name(state.name + ".new")
-        whole.write_text(json.dumps(content))
-        whole.replace(state)
+        try:
+            whole.write_text(json.dumps(content))
+            whole.replace(state)
+        except OSError as error:
+            whole.unlink(missing_ok=True)
+            raise ChainError(f"{whole} cannot be written: {error.strerror}") from error
 
 
 def start(
