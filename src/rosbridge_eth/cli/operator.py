@@ -284,6 +284,7 @@ def check(
     found = whereabouts(id, inbox, journal, time.time())
     proven: bool | None = None
     if found.block is not None:
+        proven = False
         node = open_chain(config)
         try:
             contract = Contract.at(node, deployment.contract)
@@ -301,4 +302,7 @@ def check(
         where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
         typer.echo(f"{found.state}{where}" + ("" if proven is None else f"; the contract says {str(proven).lower()}"))
     if proven is False:
-        raise VerificationError("the contract does not have the record that the store says it has")
+        raise VerificationError(
+            f"the chain does not have in block {found.block} the record that the store says is there: the chain was"
+            " reorganised a moment ago (the submitter writes it again), or the node is behind or another; ask again"
+        )

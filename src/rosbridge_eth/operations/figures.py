@@ -99,6 +99,7 @@ METRICS: Final[Mapping[str, Metric]] = _table(
     ("process_restarts", C, "How often the process was started again.", ("process",)),
     ("snapshot_age_seconds", G, "Seconds since the process last published.", ("process",)),
     # The robot.
+    ("source_dropped", C, "Messages of live topics that the robot was too slow to capture.", ()),
     ("captured", C, "Messages captured, sealed and spooled.", ()),
     ("too_large", C, "Messages left out because no record holds them.", ()),
     ("sent", C, "Records sent, repeats after a new session included.", ()),

@@ -24,6 +24,7 @@ def robot_snapshot(robot: Robot) -> Snapshot:
         NAME,
         [
             *channel_samples(robot.client.statistics(), robot.loop.socket, robot.loop.lost_sends),
+            sample("source_dropped", robot.dropped),
             sample("captured", times.records),
             sample("too_large", robot.recorder.too_large),
             sample("stage_seconds", times.capture, "capture"),

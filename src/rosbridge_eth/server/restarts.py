@@ -7,8 +7,11 @@ from rosbridge_eth.errors import ExitCode
 FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0  # seconds
 SHORT_LIFE = 5.0  # seconds; a process that lived longer began its work
 GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
-PATIENT = frozenset({ExitCode.CHAIN})
-"""Ends for which one waits as long as it takes: the node is away, and the workers go on taking records."""
+PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
+"""Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that.
+
+Meanwhile the figures go on telling so, and robots are answered or keep their records.
+"""
 
 
 class Restarts:

@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import time
@@ -233,3 +234,18 @@ def test_a_monitor_whose_port_is_taken_is_told_at_the_start(bridge: Bridge):
                               env=bridge.environment, capture_output=True, timeout=60, check=False)
     assert done.returncode == ExitCode.NETWORK
     assert "correct `monitor`" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_check_believes_the_chain_and_not_the_store(bridge: Bridge):
+    proof = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "pass").stdout.splitlines()[-1])["proof"]
+    ask = ["check", "robot_1", proof["stream"], str(proof["seq"]), "--json"]
+    found = json.loads(bridge.do(*ask).stdout)
+    assert found["proven"] is True and found["state"] in ("confirmed", "acknowledged")
+    # As after a reorganisation that the submitter has not seen yet: the chain has the batch in another block.
+    with contextlib.closing(sqlite3.connect(bridge.path / "operator/journal.sqlite")) as journal, journal:
+        assert journal.execute("UPDATE job SET block_number = block_number + 1000").rowcount > 0
+    done = subprocess.run(bridge.command(*ask), cwd=bridge.path, text=True, env=bridge.environment,
+                          capture_output=True, timeout=60, check=False)
+    assert done.returncode == ExitCode.VERIFICATION
+    assert json.loads(done.stdout)["proven"] is False
+    assert "reorganised" in done.stderr and "Traceback" not in done.stderr

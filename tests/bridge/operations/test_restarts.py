@@ -1,6 +1,8 @@
-"""When the server starts a process again: at growing intervals, not for ever, and patiently where the node is away."""
+"""When the server starts a process again: at growing intervals, not for ever, patiently where others are to blame."""
 
 from __future__ import annotations
+
+import pytest
 
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.server.restarts import GIVE_UP_AFTER, LONGEST_PAUSE, SHORT_LIFE, Restarts
@@ -38,9 +40,10 @@ def test_processes_are_counted_apart():
     assert restarts.ended("worker-0", 1, 0.0) is None
 
 
-def test_a_node_that_is_away_is_waited_for_however_long():
+@pytest.mark.parametrize("away", [ExitCode.CHAIN, ExitCode.STORE])
+def test_a_node_or_a_store_that_is_away_is_waited_for_however_long(away: ExitCode):
     restarts = Restarts()
-    pauses = [restarts.ended("submitter", ExitCode.CHAIN, 0.1) for _ in range(100)]
+    pauses = [restarts.ended("submitter", away, 0.1) for _ in range(100)]
     assert None not in pauses
     assert pauses[-1] == LONGEST_PAUSE
 
