@@ -483,6 +483,12 @@ class StoreConfig(Section):
     )
     max_records: int = Field(default=1_000_000, ge=100, description="Records kept, dead letters included.")
     max_size: Size = Field(default=GIB, ge=MIB, description="Bytes kept, dead letters included.")
+    remember: Seconds = Field(
+        default=30 * 86_400.0,
+        ge=3600,
+        description="The names of finished records are remembered so long: a record that comes again within it, from a "
+        "robot that never learnt that it was taken, is not written twice.",
+    )
 
 
 class BatchConfig(Section):

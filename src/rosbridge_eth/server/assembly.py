@@ -211,6 +211,7 @@ def open_submission(
         limits=settings.limits,
         holder=holder,
         keep_batches=config.chain.keep,
+        remember=config.store.remember,
         prune=journal.prune,
         on_confirmed=on_confirmed,
     )

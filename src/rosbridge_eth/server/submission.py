@@ -29,7 +29,6 @@ LEASE_BYTES = 1 << 20
 GATHER_RECORDS = 4096  # held in open batches at most: with many robots that say little, a few from each
 GATHER_BYTES = 8 << 20  # taken over in one turn at most
 MAX_BACKLOG = 256  # batches on their way, above which the inbox keeps the rest; some 24 MiB at most
-DONE_KEPT = 30 * 86_400.0  # seconds for which finished identities are recognised as duplicates
 FORGET_EVERY = 3600.0
 SHORTEST_PAUSE, LONGEST_PAUSE = 0.005, 0.5
 
@@ -56,12 +55,13 @@ class Submission:
         limits: Limits,
         holder: str,
         keep_batches: float,
+        remember: float,
         prune: Callable[[float], int],
         on_confirmed: Callable[[BatchTiming], None] = lambda timing: None,
     ) -> None:
         self._inbox, self._submitter, self._chain = inbox, submitter, chain
         self._limits, self._batcher, self._holder = limits, Batcher(limits), holder
-        self._keep_batches, self._prune = keep_batches, prune
+        self._keep_batches, self._prune, self._remember = keep_batches, prune, remember
         self._forget_at = 0.0
         self._on_confirmed = on_confirmed
         self._said: str | None = None
@@ -86,7 +86,7 @@ class Submission:
         if now >= self._forget_at:
             self._forget_at = now + FORGET_EVERY
             with self._inbox_may_be_away():
-                self._inbox.forget(now - DONE_KEPT)
+                self._inbox.forget(now - self._remember)
             self._prune(now - self._keep_batches)
         return moved
 
