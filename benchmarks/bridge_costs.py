@@ -187,7 +187,7 @@ def throughput(who: Identities, folder: Path, count: int) -> float:
         server = Server(ServerConfig(), who.server, who.trust, cookie_key(who.server), time.monotonic())
         Worker(
             server, who.reception(server, inbox),
-            lambda on_event, on_batch: UdpLoop(server, sock, on_event, on_batch=on_batch), lambda peer: True,
+            lambda on_event, on_batch: UdpLoop(server, sock, on_event, on_batch=on_batch), lambda peer: True, lambda: 1,
         ).run(stop.is_set)
 
     serving = context.Process(target=serve)

@@ -139,6 +139,7 @@ def open_worker(
         reception,
         lambda on_event, on_batch: UdpLoop(server, sock, on_event, on_batch=on_batch),
         trust.allowed or (lambda peer: True),
+        registry.revision,
     )
 
 

@@ -18,7 +18,11 @@ LONGEST_WAIT = 0.5
 
 
 class Worker:
-    """Drives a Reception over a socket until told to stop. allowed: the allow list, asked once a second."""
+    """Drives a Reception over a socket until told to stop.
+
+    allowed: the allow list. revision: another value after each change of it, asked once a second; the list itself is
+    gone through only then, and after a session began, whose handshake may have been allowed before the change.
+    """
 
     def __init__(
         self,
@@ -26,10 +30,12 @@ class Worker:
         reception: Reception,
         make_loop: Callable[[Callable[[Event], None], Callable[[float], None]], UdpLoop],
         allowed: Callable[[PeerIdentity], bool],
+        revision: Callable[[], object],
     ) -> None:
         self.server, self.reception = server, reception
         self.loop = make_loop(self._on_event, self._on_batch)
-        self._allowed = allowed
+        self._allowed, self._revision = allowed, revision
+        self._looked_at: object = None  # the revision that all sessions were held against
         self._arrived: list[MessageReceived] = []
         self._look_at = 0.0
 
@@ -38,6 +44,7 @@ class Worker:
             case MessageReceived():
                 self._arrived.append(event)
             case Connected(peer=peer):
+                self._looked_at = None
                 log.info("%s: session begun", peer)
             case Disconnected(reason=reason, peer=peer):
                 log.info("%s: session ended, %s", peer, reason)
@@ -63,6 +70,10 @@ class Worker:
         self.loop.close()
 
     def _close_revoked(self, now: float) -> None:
+        revision = self._revision()  # before the list: a change in between is seen the next time
+        if revision == self._looked_at:
+            return
+        self._looked_at = revision
         for peer in self.server.peers():
             if not self._allowed(peer):
                 log.warning("%s is no longer allowed; its session is closed", peer)
