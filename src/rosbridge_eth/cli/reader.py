@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,12 @@ from rosbridge_eth.config.values import parse_time
 from rosbridge_eth.errors import ConfigError, VerificationError
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.passphrases import read_passphrase
+
+if TYPE_CHECKING:
+    from rosbridge_eth.reader import Reading
+
+OWNER = "owner"
+"""The reader that `init` makes."""
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -35,7 +41,7 @@ def read(
     config: Annotated[
         Path | None, typer.Option(help="A reader.toml: contract, CA, identity and node; then no home is needed.")
     ] = None,
-    reader: Annotated[str, typer.Option(help="Which reader of the home reads.")] = "owner",
+    reader: Annotated[str | None, typer.Option(help="Which reader of the home reads.", show_default="owner")] = None,
     passphrase_file: Annotated[
         Path | None, typer.Option(help="Read the reader's passphrase from the first line of this file.")
     ] = None,
@@ -43,7 +49,10 @@ def read(
     from_: Annotated[str | None, typer.Option("--from", help="Only from this time on (RFC 3339).")] = None,
     to: Annotated[str | None, typer.Option(help="Only before this time (RFC 3339).")] = None,
     at: Annotated[str | None, typer.Option(help="The state at this moment: each topic's last record by then.")] = None,
-    bag: Annotated[Path | None, typer.Option(help="Write a bag that ROS tools open.")] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(help="Write a bag that ROS tools open: NAME.bag (ROS 1), NAME.mcap, NAME.db3, or NAME, a folder."),
+    ] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw the trajectory (.png, .svg, .pdf).")] = None,
     json: Json = False,
     from_block: Annotated[int | None, typer.Option(min=0, help="Read the chain from this block on.")] = None,
@@ -57,8 +66,19 @@ def read(
     from rosbridge_eth.reading import outputs
 
     choice = Choice(topic, _time(from_), _time(to), _time(at))
-    end = open_reader(OperatorHome(home), config, reader, lambda: read_passphrase(
-        "reader", f"Passphrase of reader {reader}", file=passphrase_file))
+    if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
+        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
+    if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
+        raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
+    if config is not None and reader is not None:
+        raise typer.BadParameter("a reader.toml names its reader itself: give one of the two", param_hint="--reader")
+    if bag is not None:
+        outputs.check_bag(bag)
+    if plot is not None:
+        outputs.check_picture(plot)
+    who = reader or OWNER
+    end = open_reader(OperatorHome(home), config, who, lambda: read_passphrase(
+        "reader", "Passphrase of the reader" if config else f"Passphrase of reader {who}", file=passphrase_file))
     try:
         reading = read_robot(
             end.chain, end.contract, robot, roots=end.roots, reader=end.identity,
@@ -71,7 +91,8 @@ def read(
     if bag is not None:
         written = outputs.write_bag(bag, records)
         talk(f"{bag}: {written.whole} messages whole, {written.partial} in part, {written.as_json} as JSON")
-    if plot is not None:
+    drawn = plot is not None and bool(outputs.positions(records))
+    if plot is not None and drawn:
         outputs.draw_trajectory(plot, records)
     if bag is None and plot is None and not json:
         for record in records:
@@ -81,14 +102,26 @@ def read(
         print_json(_summary(reading, findings, [outputs.as_json(record) for record in records]))
     for finding in findings:
         talk(finding)
-    talk(f"{robot}: {len(reading.proven.records)} records proven, {len(chosen)} chosen; "
-         + ("complete" if reading.complete else "sound, its end is open" if reading.sound else "NOT SOUND"))
+    talk(f"{robot}: {len(reading.proven.records)} records proven, {len(chosen)} chosen; " + _verdict(reading))
+    if topic is not None and not any(record.captured.topic == topic for record in chosen):
+        topics = sorted({record.captured.topic for record in Choice().choose(reading.proven.records)})
+        if topic not in topics:
+            talk(f"nothing was read on {topic}; what was read is on: {', '.join(topics) or 'no topic'}")
     if not reading.sound:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
+    if plot is not None and not drawn:
+        raise ConfigError(f"{plot} is not drawn: none of the {len(records)} chosen records holds a position")
 
 
-def _summary(reading: Any, findings: list[str], records: list[Any]) -> dict[str, Any]:
+def _verdict(reading: Reading) -> str:
+    if not reading.sound:
+        return "NOT SOUND"
+    return "complete" if reading.complete else ", ".join(["sound", *reading.open_ends])
+
+
+def _summary(reading: Reading, findings: list[str], records: list[Any]) -> dict[str, Any]:
     return {
-        "robot": reading.robot, "sound": reading.sound, "complete": reading.complete,
+        "robot": reading.robot, "sound": reading.sound, "complete": reading.complete, "open": reading.open_ends,
+        "from_block": reading.history.from_block, "to_block": reading.history.to_block,
         "proven": len(reading.proven.records), "findings": findings, "records": records,
     }

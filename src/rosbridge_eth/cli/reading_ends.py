@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rosbridge_eth import ledger
 from rosbridge_eth.config import load_reader_config, load_server_config
+from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.identity import Identity, load_identity, read_certificates
 from rosbridge_eth.ledger import Chain
@@ -34,5 +35,8 @@ def open_reader(home: OperatorHome, config: Path | None, name: str, passphrase: 
         return ReadingEnd(ledger.connect(settings.chain), settings.contract, roots, identity, settings.from_block)
     server = load_server_config(home.require().config)
     deployment = home.deployment()
+    readers = sorted(key.parent.name for key in (home.path / "readers").glob("*/enc.key.pem"))
+    if name not in readers:
+        raise IdentityError(f"no such reader: {name}; there are {', '.join(readers)}, and `reader NAME` makes another")
     identity, roots = load_identity(home.reader(name), passphrase())
     return ReadingEnd(ledger.connect(server.chain.url), deployment.contract, roots, identity, 0)

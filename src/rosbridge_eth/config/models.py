@@ -557,7 +557,10 @@ class ReaderConfig(Section):
     chain: ChainUrl = Field(
         default="http://127.0.0.1:8545", description="JSON-RPC URL of any node of the chain.", repr=False
     )
-    from_block: int = Field(default=0, ge=0, description="The block of the contract's deployment, or later.")
+    from_block: int = Field(
+        default=0, ge=0,
+        description="The block of the contract's deployment, or later; what a robot wrote before it is not read.",
+    )
 
 
 ROOTS: tuple[type[Section], ...] = (RobotConfig, ServerConfig, ReaderConfig)

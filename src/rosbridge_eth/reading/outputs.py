@@ -12,8 +12,9 @@ A bag says no more than what was recorded:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from math import isfinite
@@ -26,6 +27,8 @@ from rosbridge_eth.reading.history import ProvenRecord
 
 NOTES: Final = "/rosbridge_eth/notes"
 _STRING: Final = "std_msgs/msg/String"
+_BAGS: Final = "NAME.bag (ROS 1), NAME.mcap or NAME.db3 (ROS 2, one file), or NAME (ROS 2, a folder)"
+_PICTURES: Final = "name it .png, .svg or .pdf"
 
 
 def as_json(record: ProvenRecord) -> dict[str, Any]:
@@ -60,17 +63,15 @@ class BagSummary:
 
 
 def write_bag(path: Path, records: Iterable[ProvenRecord]) -> BagSummary:
-    """Write a bag: ROS 1 if the name ends in .bag, else a ROS 2 bag (a folder, sqlite3).
+    """Write a bag of the kind that `check_bag` finds the name to say.
 
-    Messages bear the time at which they were received. ConfigError if the path exists.
+    Messages bear the time at which they were received. ConfigError as `check_bag` raises it.
     """
-    if path.exists():
-        raise ConfigError(f"{path} is there already; name a bag that is not")
-    wire = Wire.ROS1 if path.suffix == ".bag" else Wire.CDR
+    wire = check_bag(path)
     captured = [(record, _captured(record)) for record in records]
     captured.sort(key=lambda pair: pair[1].received_ns)
     with ExitStack() as stack:
-        bag = _Bag(stack.enter_context(_writer(path, wire)), wire)
+        bag = _Bag(stack.enter_context(_writer(path)), wire)
         for record, content in captured:
             bag.write(record, content)
         bag.write_notes(captured[-1][1].received_ns if captured else 0)
@@ -84,10 +85,36 @@ def _captured(record: ProvenRecord) -> CapturedRecord:
         raise VerificationError(f"record {record.id}: {error}") from None
 
 
-def _writer(path: Path, wire: Wire) -> Any:
+def check_bag(path: Path) -> Wire:
+    """The wire format of a bag of this name: .bag is ROS 1; .mcap and .db3 are single files, no ending a folder.
+
+    ConfigError for any other ending, and if the path exists.
+    """
+    if path.suffix not in ("", ".bag", ".mcap", ".db3"):
+        raise ConfigError(f"{path}: a bag cannot be a {path.suffix} file; name it {_BAGS}")
+    if path.exists():
+        raise ConfigError(f"{path} is there already; name a bag that is not")
+    return Wire.ROS1 if path.suffix == ".bag" else Wire.CDR
+
+
+@contextmanager
+def _writer(path: Path) -> Iterator[Any]:
     from rosbags import rosbag1, rosbag2
 
-    return rosbag1.Writer(path) if wire is Wire.ROS1 else rosbag2.Writer(path, version=9)
+    if path.suffix == ".bag":
+        with rosbag1.Writer(path) as writer:
+            yield writer
+    elif path.suffix == "":
+        with rosbag2.Writer(path, version=9) as folder:
+            yield folder
+    else:
+        plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+        # A ROS 2 bag is written as a folder; its one storage file has the definitions too and stands by itself.
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as within:
+            with rosbag2.Writer(Path(within, path.stem), version=9, storage_plugin=plugin) as single:
+                yield single
+            [storage] = Path(within, path.stem).glob(f"*{path.suffix}")
+            storage.rename(path)
 
 
 class _Bag:
@@ -182,6 +209,18 @@ def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
+def check_picture(path: Path) -> str:
+    """The format that the name's ending says, in capitals or not. ConfigError where it says none that can be drawn."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kind = path.suffix.removeprefix(".").lower()
+    if not kind:
+        raise ConfigError(f"{path}: the ending says which kind of picture it is; {_PICTURES}")
+    if kind not in FigureCanvasBase.get_supported_filetypes():
+        raise ConfigError(f"{path}: a picture cannot be a .{kind} file; {_PICTURES}")
+    return kind
+
+
 def draw_trajectory(path: Path, records: Iterable[ProvenRecord]) -> int:
     """Draw where the robot was, as seen from above, in the format of the name's ending; how many positions there are.
 
@@ -190,9 +229,10 @@ def draw_trajectory(path: Path, records: Iterable[ProvenRecord]) -> int:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    kind = check_picture(path)
     tracks = positions(records)
     figure = Figure(figsize=(7, 6), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for topic, track in tracks.items():
         _draw_track(axes, topic, sorted(track))
@@ -205,9 +245,6 @@ def draw_trajectory(path: Path, records: Iterable[ProvenRecord]) -> int:
     else:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no positions in these records", ha="center", va="center", transform=axes.transAxes)
-    kind = path.suffix.removeprefix(".") or "png"
-    if kind not in canvas.get_supported_filetypes():
-        raise ConfigError(f"{path}: a picture cannot be a .{kind} file; name it .png, .svg or .pdf")
     figure.savefig(path, format=kind, dpi=150)
     return sum(len(track) for track in tracks.values())
 
