@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from rosbridge_eth.errors import ChainError, StoreError
 from rosbridge_eth.ledger import merkle, packing
 from rosbridge_eth.ledger.batching import halves
-from rosbridge_eth.ledger.states import OPEN, Event, Kind, State, after
+from rosbridge_eth.ledger.states import IN_FLIGHT, OPEN, Event, Kind, State, after
 from rosbridge_eth.ledger.transactions import Fees, SignedTransaction
 from rosbridge_eth.records import RecordId, SealedRecord
 
@@ -652,6 +652,35 @@ class Journal:
             if job.nonce is not None and job.account is not None:
                 filler = self._insert_filler(db, job.robot, job.account, job.nonce, now, changed)
             return changed, filler
+
+    def give_up(
+        self, robot: bytes, accounts: Collection[str], spent: Collection[tuple[str, int]], reason: str, now: float
+    ) -> int:
+        """Every record of a robot that is in no block becomes a dead letter; how many.
+
+        accounts: those that were ever the robot's. spent: of these, nonces with which a batch was written; it is left
+        to the submitter, which learns so. Needs no lease and takes them all: a submitter that acts for one of the
+        accounts reads the journal anew before it does anything more for the robot.
+        """
+        sql = f"SELECT {_COLUMNS} FROM job WHERE robot = ? AND state IN (?, ?, ?, ?)"  # noqa: S608 - a constant
+        buried = 0
+        with self.transaction() as db:
+            rows = db.execute(sql, (robot, *IN_FLIGHT, State.SEALED, State.SPLIT)).fetchall()
+            for job in (_job(row) for row in rows):
+                if (job.account, job.nonce) in spent or not (job.kind is Kind.BATCH or job.account in accounts):
+                    continue
+                letters = self.records(job) if job.kind is Kind.BATCH and job.state is not State.SPLIT else []
+                event = Event.REFUSED if letters else Event.SETTLED
+                values = (after(job.state, event), reason, job.id)
+                db.execute("UPDATE job SET state = ?, reason = ? WHERE id = ?", values)
+                for record in letters:
+                    self._dead_letter(db, record, reason, now, job.id)
+                buried += len(letters)
+            db.executemany(
+                "UPDATE lease SET holder = '', token = token + 1, expires = 0 WHERE account = ?",
+                [(account,) for account in accounts],
+            )
+        return buried
 
     def fill(self, robot: bytes, lease: Lease, nonce: int, now: float) -> Job:
         """Plan a filler for a nonce that nothing holds; `robot`: whose account it is, b"" for the operator's."""

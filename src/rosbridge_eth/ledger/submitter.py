@@ -358,6 +358,8 @@ class Submitter:
         wanted: list[Action] = [ReadHead()] if head is None else self._round(head, now)
         if self._stale and head is not None:
             self._jobs = {job.id: job for job in self._journal.jobs()}
+            waiting = {job.robot for job in self._jobs.values()}
+            self._blocked = {robot: why for robot, why in self._blocked.items() if robot in waiting}
             self._stale = False
             wanted = self._round(head, now)
         fresh = [action for action in wanted if action not in self._asked]
@@ -486,7 +488,12 @@ class Submitter:
         return Call(account, b"", account)
 
     def _fill_gaps(self, account: str, robot: bytes, view: AccountView, now: float) -> None:
-        """A nonce that nothing holds would keep all later ones waiting for ever."""
+        """A nonce that nothing holds would keep all later ones waiting for ever.
+
+        Nothing is later where the account was a robot's and is so no more: its key is not at hand, and need not be.
+        """
+        if not any(signer is not None and signer.address == account for signer in self._signers(robot)):
+            return
         for nonce in range(view.nonce, self._journal.next_nonce(account)):
             if not self._journal.nonce_is_used(account, nonce):
                 self._keep(self._journal.fill(robot, self._leases[account], nonce, now))
@@ -632,8 +639,10 @@ class Submitter:
                 self._views_of.pop(job.account or "", None)
 
     def _lease_of(self, job: Job, now: float) -> Lease | None:
-        """Of the account a job is signed by; None while another submitter has it."""
-        return self._leases[job.account] if job.account is not None and self._leased(job.account, now) else None
+        """Of the account a job is signed by; None while another has it, or had it and the job is not read anew yet."""
+        if job.account is None or not self._leased(job.account, now) or self._stale:
+            return None
+        return self._leases[job.account]
 
     # ---- signing
 
@@ -694,7 +703,7 @@ class Submitter:
 
     def _signer(self, job: Job) -> LocalAccount | None:
         """Whose key signs: the account the job has a nonce of, while the key is at hand."""
-        candidates = [self._operator, self._account_of(job.robot) if job.robot else None]
+        candidates = self._signers(job.robot)
         if job.kind is Kind.BATCH:
             candidates.reverse()
         for signer in candidates:
@@ -702,6 +711,9 @@ class Submitter:
                 return signer
         self._blocked[job.robot] = f"the key of {job.account} is not at hand"
         return None
+
+    def _signers(self, robot: bytes) -> list[LocalAccount | None]:
+        return [self._operator, self._account_of(robot) if robot else None]
 
     def _on_estimate_failed(self, id: int, failure: NodeFailure, now: float) -> None:
         job = self._jobs.get(id)

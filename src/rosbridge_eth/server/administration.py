@@ -7,6 +7,7 @@ chain is ordered so that it can be run again after a crash between any two.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -36,7 +37,7 @@ from rosbridge_eth.identity import (
 )
 from rosbridge_eth.ledger import Chain, Contract, deploy
 from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.journal import Binding
+from rosbridge_eth.ledger.journal import Attempt, Binding
 from rosbridge_eth.reading import join_certificates
 from rosbridge_eth.records import robot_id
 from rosbridge_eth.registry import Enrolment, Registry
@@ -44,7 +45,11 @@ from rosbridge_eth.server.assembly import open_inbox, open_journal
 from rosbridge_eth.server.worker import LOOK_AT_LIST
 from smcrypto import InvalidKey, sm2, x509
 
+log = logging.getLogger(__name__)
+
 OWNER = "owner"
+GIVEN_UP = "given up by `revoke {}`"  # the reason of dead letters
+GIVE_UP_AT_ONCE = 256  # records
 HANDING_OVER = 2 * LOOK_AT_LIST  # seconds after which no session of a name out of force is left
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
 LAST_WRITES = 20.0  # the same, where a robot is revoked and not replaced: then its right ends all the same
@@ -175,12 +180,16 @@ def _deployment(contract: Contract) -> Deployment:
 
 @dataclass(frozen=True, slots=True)
 class Registered:
-    """A robot that was registered: its account, the block, and the bundle's file (None for a --csr robot's key)."""
+    """A robot that was registered: its account, the block, and the bundle's file.
+
+    given_up: records that the name's revoked identity had handed over and that became dead letters.
+    """
 
     name: str
     account: str
     block: int
     bundle: Path
+    given_up: int = 0
 
 
 def register_robot(
@@ -240,6 +249,11 @@ def register_robot(
             raise IdentityError(
                 f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
             )
+        given_up = 0
+        if known and not before.may_write:
+            if registry.find(Role.ROBOT, name) is not None:
+                registry.revoke(Role.ROBOT, name, now)
+            given_up = _give_up(home, config, registry, name, chain, clock, pause)
         call = "replaceRegistration" if known else "registration"
         receipt = contract.transact(keys.operator, call, robot_id(name), account, certificates)
         allot(contract, keys, account, config)
@@ -257,7 +271,58 @@ def register_robot(
         registry.close()
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, seal_bundle(bundle, password), mode=0o600)
-    return Registered(name, account, receipt.block_number, path)
+    return Registered(name, account, receipt.block_number, path, given_up)
+
+
+def _give_up(
+    home: OperatorHome,
+    config: ServerConfig,
+    registry: Registry,
+    name: str,
+    chain: Chain,
+    clock: Callable[[], float],
+    pause: Callable[[float], None],
+) -> int:
+    """Make dead letters of what a revoked robot handed over and the chain does not have; how many records.
+
+    The account of the name's next identity would write them, and readers would find records of a revoked one. A
+    server may run meanwhile. From the inbox to the journal first, then what is in the journal, so that a record that
+    is sealed in between is found there; each step can be done again.
+    """
+    robot, reason = robot_id(name), GIVEN_UP.format(name)
+    ended = [e for e in registry.all(Role.ROBOT) if e.name == name]
+    closed = max((e.revoked_at.timestamp() for e in ended if e.revoked_at is not None), default=0.0) + HANDING_OVER
+    pause_for = min(closed - clock(), HANDING_OVER)
+    if pause_for > 0:
+        pause(pause_for)
+    inbox, journal = open_inbox(config, home), open_journal(home, home.deployment())
+    buried = 0
+    try:
+        while held := inbox.held(robot, GIVE_UP_AT_ONCE):
+            with journal.transaction():
+                known = journal.known(record.id for record in held)
+                for record in held:
+                    if record.id not in known:
+                        journal.bury(record, reason, clock())
+                        buried += 1
+            inbox.done([record.id for record in held], clock())
+        nonces = {(job.account, job.nonce) for job in journal.jobs()
+                  if job.robot == robot and job.account is not None and job.nonce is not None}
+        spent = {(account, nonce) for account, nonce in nonces if _written(chain, journal.attempts(account, nonce))}
+        accounts = [e.account for e in ended if e.account is not None]
+        buried += journal.give_up(robot, accounts, spent, reason, clock())
+    finally:
+        inbox.close()
+        journal.close()
+    if buried:
+        log.warning("%d records that %s had handed over before it was revoked are dead letters now", buried, name)
+    return buried
+
+
+def _written(chain: Chain, attempts: Sequence[Attempt]) -> bool:
+    """Is one of these transactions in a block, and did it do what it was for?"""
+    receipts = chain.receipts([attempt.hash for attempt in attempts])
+    return any(receipt is not None and receipt.succeeded for receipt in receipts)
 
 
 def _handed_over_is_written(

@@ -105,6 +105,10 @@ class Inbox(Protocol):
         """Give back all that `consumer` leased: it has just started, and knows of none that an earlier life took."""
         ...
 
+    def held(self, robot: bytes, limit: int) -> list[SealedRecord]:
+        """The first `limit` records of one robot that are not finished, leased or not, in their order."""
+        ...
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         """The journal has these: let go of the bytes, remember the identities. Unknown or finished ones: no effect."""
         ...

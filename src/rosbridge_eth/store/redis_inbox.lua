@@ -192,6 +192,16 @@ function operations.reclaim(consumer)
   end
 end
 
+-- held ROBOT limit: {stream seq ciphertext} for each of its first records, leased or not
+function operations.held(robot, limit)
+  local found = {}
+  for _, place in ipairs(call('ZRANGE', QUEUE .. robot, 0, tonumber(limit) - 1)) do
+    local fields = read(id_in(place))
+    found[#found + 1] = {fields.s, fields.q, fields.c}
+  end
+  return found
+end
+
 -- finish "1"|"2" reason now {ROBOT stream seq}: done, or dead for that reason
 function operations.finish(state, reason, now)
   local records, bytes = 0, 0

@@ -151,6 +151,12 @@ class RedisInbox:
     def reclaim(self, consumer: str) -> None:
         self._call("reclaim", consumer)
 
+    def held(self, robot: bytes, limit: int) -> list[SealedRecord]:
+        return [
+            SealedRecord(RecordId(robot, stream, int.from_bytes(seq, "big")), ciphertext)
+            for stream, seq, ciphertext in self._call("held", robot.hex(), limit)
+        ]
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         self._for_each(ids, "finish", _CODES[State.DONE], "", repr(now))
 

@@ -126,6 +126,11 @@ SELECT record.no, tk, id, seq, ciphertext, arrived, attempts
 FROM record JOIN robot ON record.robot = robot.no JOIN stream ON record.stream = stream.no
 WHERE record.robot = :robot AND +until <= :now ORDER BY record.stream, seq LIMIT :limit
 """
+INBOX_HELD_OF: Final = """
+SELECT id, seq, ciphertext
+FROM record JOIN robot ON record.robot = robot.no JOIN stream ON record.stream = stream.no
+WHERE tk = ? ORDER BY record.stream, seq LIMIT ?
+"""
 INBOX_LEASE: Final = "UPDATE record SET lessee = ?, until = ?, attempts = attempts + 1 WHERE no = ?"
 INBOX_RELEASE: Final = """
 UPDATE record SET lessee = '', until = 0 WHERE robot = ? AND stream = ? AND seq = ? AND lessee = ?

@@ -130,6 +130,13 @@ class SqliteInbox:
         with self._writing() as db:
             db.execute(sql.INBOX_RECLAIM, (consumer,))
 
+    def held(self, robot: bytes, limit: int) -> list[SealedRecord]:
+        with self._reading() as db:
+            return [
+                SealedRecord(RecordId(robot, stream, int.from_bytes(seq, "big")), ciphertext)
+                for stream, seq, ciphertext in db.execute(sql.INBOX_HELD_OF, (robot, limit))
+            ]
+
     def done(self, ids: Iterable[RecordId], now: float) -> None:
         self._finish(ids, State.DONE, "", now)
 

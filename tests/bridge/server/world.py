@@ -25,6 +25,7 @@ from rosbridge_eth.server.administration import (
     revoke,
 )
 from rosbridge_eth.server.assembly import bound_contract, open_inbox, open_journal, open_submission
+from rosbridge_eth.server.submission import Submission
 from rosbridge_eth.store import Outcome
 
 PASSPHRASE, NOW = b"operator's", datetime.now(UTC)
@@ -47,11 +48,14 @@ class World:
         deployment = deploy_contract(self.home, self.chain, self.keys)
         self.contract: Contract = bound_contract(self.chain, deployment)
         self.home.config.write_text(f"{self.home.config.read_text()}\n{self.settings}")
-        config = load_server_config(self.home.config)
-        self.inbox = open_inbox(config, self.home)
+        self.inbox = open_inbox(load_server_config(self.home.config), self.home)
         self.registry = Registry(self.home.registry)
-        self.submission = open_submission(
-            config=config, contract=self.contract, journal=open_journal(self.home, deployment),
+        self.submission = self.next_submission()
+
+    def next_submission(self) -> Submission:
+        config = load_server_config(self.home.config)
+        return open_submission(
+            config=config, contract=self.contract, journal=open_journal(self.home, self.home.deployment()),
             inbox=open_inbox(config, self.home), registry=self.registry, keys=self.keys,
         )
 
@@ -67,7 +71,7 @@ class World:
 
     def hand_over(self, first: int, count: int) -> list[Outcome]:
         seqs = range(first, first + count)
-        records = [SealedRecord(RecordId(TK, bytes(16), seq), bytes([seq]) * 300) for seq in seqs]
+        records = [SealedRecord(RecordId(TK, bytes(16), seq), bytes([seq % 256]) * 300) for seq in seqs]
         return self.inbox.append(records, self.now)
 
     def wait(self, seconds: float) -> None:

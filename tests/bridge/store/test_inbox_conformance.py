@@ -182,6 +182,17 @@ def test_one_robot_can_be_asked_for(inbox):
     assert take(inbox, robot=b"c" * 32) == []
 
 
+def test_all_that_is_held_of_one_robot_can_be_looked_at_whoever_leased_it(inbox):
+    inbox.append([record(n) for n in (2, 0, 1)], T0)
+    inbox.append([record(5, stream=S2), record(7, robot=B)], T0)
+    take(inbox, limit=1)
+    inbox.done([record(1).id], T0)
+    assert inbox.held(A, 100) == [record(0), record(2), record(5, stream=S2)]
+    assert inbox.held(A, 2) == [record(0), record(2)]
+    assert inbox.held(b"c" * 32, 100) == []
+    assert inbox.statistics(T0).leased == 1
+
+
 def test_released_records_are_given_out_again_in_order(inbox):
     inbox.append([record(n) for n in range(4)], T0)
     leased = take(inbox, "one")
