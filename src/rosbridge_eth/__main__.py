@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from types import FrameType
 
 
 def main() -> int:
     """Run the command line; without the packages of the extra [bridge], say how to get them."""
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a shell's background job ignores it
+    if ours:
+        signal.signal(signal.SIGINT, _leave)
     try:
         from rosbridge_eth.cli import run
     except ModuleNotFoundError as error:
@@ -18,7 +24,15 @@ def main() -> int:
             file=sys.stderr,
         )
         return 1
+    if ours:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     return run()
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """Ctrl-C while the packages load, when nothing is begun yet: an exception would show where in them it struck."""
+    os.write(2, b"rosbridge-eth: interrupted\n")
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

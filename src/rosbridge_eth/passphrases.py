@@ -14,6 +14,9 @@ from pathlib import Path
 
 from rosbridge_eth.errors import IdentityError
 
+_PASSWORDS = {"robot", "keystore"}
+"""What is given with --password-file; so is a new reader's, beside the operator's --passphrase-file."""
+
 
 def credential(name: str, environment: Mapping[str, str] = os.environ) -> Path | None:
     """The file in which the service manager hands over the passphrase called `name`, if it does."""
@@ -34,12 +37,16 @@ def read_passphrase(
     file = file or credential(name, environment)
     if file is not None:
         return _from_file(file)
+    option = "--password-file" if name in _PASSWORDS or (name == "reader" and confirm) else "--passphrase-file"
     if not sys.stdin.isatty():
-        raise IdentityError(
-            f"the {name} passphrase is needed and there is no terminal to ask at: give --passphrase-file"
-        )
-    passphrase = getpass.getpass(f"{prompt}: ")
-    if confirm and getpass.getpass(f"{prompt} (again): ") != passphrase:
+        raise IdentityError(f"the {name} passphrase is needed and there is no terminal to ask at: give {option}")
+    try:
+        passphrase = getpass.getpass(f"{prompt}: ")
+        again = getpass.getpass(f"{prompt} (again): ") if confirm else passphrase
+    except EOFError:  # Ctrl-D: nobody who would answer
+        sys.stderr.write("\n")  # the prompt's line has no end yet
+        raise IdentityError(f"the {name} passphrase is needed and none was given: give {option}") from None
+    if again != passphrase:
         raise IdentityError("the two passphrases differ; nothing was written")
     if not passphrase:
         raise IdentityError("an empty passphrase protects nothing; choose another")

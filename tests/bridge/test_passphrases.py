@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
+import pty
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,7 +35,41 @@ def test_an_empty_or_missing_file_is_refused_by_name(tmp_path: Path, content: by
         read_passphrase("robot", "Robot", file=tmp_path / "p")
 
 
-def test_without_a_terminal_it_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name, confirm, option", [
+    ("operator", False, "--passphrase-file"), ("operator", True, "--passphrase-file"),
+    ("reader", False, "--passphrase-file"), ("reader", True, "--password-file"), ("robot", False, "--password-file"),
+    ("keystore", True, "--password-file"),
+])
+def test_without_a_terminal_it_does_not_wait(
+    name: str, confirm: bool, option: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
-    with pytest.raises(IdentityError, match="--passphrase-file"):
-        read_passphrase("robot", "Robot", environment={})
+    with pytest.raises(IdentityError, match=option):
+        read_passphrase(name, "Of whom", environment={}, confirm=confirm)
+
+
+@pytest.mark.parametrize("typed", [["\x04"], ["words\n", "\x04"]])
+def test_the_end_of_input_at_a_terminal_says_the_same(typed: list[str]) -> None:
+    """Ctrl-D at the first prompt, and at the second: what is raised by a process whose input is a terminal."""
+    script = (
+        "from rosbridge_eth.errors import IdentityError\n"
+        "from rosbridge_eth.passphrases import read_passphrase\n"
+        "try: read_passphrase('operator', 'Operator passphrase', environment={}, confirm=True)\n"
+        "except IdentityError as error: print('SAID', error)\n"
+    )
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen([sys.executable, "-c", script], stdin=theirs, stdout=theirs, stderr=theirs,
+                               start_new_session=True)
+    os.close(theirs)
+    shown = ""
+    for number, answer in enumerate(typed, 1):
+        while shown.count(": ") < number:  # each prompt ends so
+            shown += os.read(ours, 1024).decode()
+        os.write(ours, answer.encode())
+    with contextlib.suppress(OSError):  # how Linux tells that the other side of a terminal is closed
+        while part := os.read(ours, 1024):
+            shown += part.decode()
+    os.close(ours)
+    assert process.wait(timeout=30) == 0
+    assert "SAID the operator passphrase is needed and none was given: give --passphrase-file" in shown
+    assert "words" not in shown and "Traceback" not in shown

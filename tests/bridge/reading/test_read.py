@@ -1,4 +1,4 @@
-"""`read` at a chain that holds a robot's two runs: what it says of parts, of names that are none, of files it writes."""
+"""`read` of a robot's two runs: what it says of a part of them, of names that are none, and which files it writes."""
 
 from __future__ import annotations
 
@@ -71,10 +71,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Place:
     chain.fund(account.address, 10**18)
     contract = ledger.Contract.at(chain, deployment.contract)
     blocks, tk = [], identity.public.robot_id
-    for number, (topic, type_name, data) in enumerate([
+    runs: list[tuple[str, str, dict[str, object]]] = [
         ("/odom", "geometry_msgs/msg/Point", {"x": 1.0, "y": 2.0, "z": 0.0}),
         ("/text", "std_msgs/msg/String", {"data": "hello"}),
-    ]):
+    ]
+    for number, (topic, type_name, data) in enumerate(runs):
         # Each knows nothing of another: a robot that lost its spool between the two runs.
         sealer = Sealer(tk, partial(sign, identity.signing_key), [owner.encryption_key.public_key])
         records = [r for n in range(3) for r in sealer.seal(message(n + 10 * number, topic, data, type_name), n)]
