@@ -29,6 +29,7 @@ from smcrypto.sm2.points import base_comb, secret_sum, to_affine_all
 __all__ = [
     "ITERATIONS",
     "MAX_ITERATIONS",
+    "MAX_PURE_ITERATIONS",
     "MAX_SCRYPT_BLOCKS",
     "MAX_SCRYPT_MEMORY",
     "dump_private",
@@ -45,6 +46,8 @@ ITERATIONS: Final = 100_000
 """PBKDF2 iterations of the keys we write (OpenSSL 3.0 writes 2,048, GmSSL 65,536)."""
 MAX_ITERATIONS: Final = 10_000_000
 """The most PBKDF2 iterations a key file may ask for: seconds with OpenSSL's hashes."""
+MAX_PURE_ITERATIONS: Final = 1_000_000
+"""The most where they are of SM3 and `sm3.ENGINE` is "python", 0.11 ms each: two minutes."""
 MAX_SCRYPT_MEMORY: Final = 256 << 20
 """The most memory, 128 * N * r bytes, that scrypt may ask for."""
 MAX_SCRYPT_BLOCKS: Final = 1 << 23
@@ -358,8 +361,13 @@ def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
         function.finish()
     hash_name = _PRFS[name]
     if hash_name == "sm3":
-        from smcrypto import kdf
+        from smcrypto import kdf, sm3
 
+        if sm3.ENGINE == "python" and iterations > MAX_PURE_ITERATIONS:
+            raise InvalidKey(
+                f"the key file asks for {iterations} PBKDF2 iterations of SM3; without OpenSSL's SM3 the limit is"
+                f" {MAX_PURE_ITERATIONS}"
+            )
         return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length)
     return lambda password: hashlib.pbkdf2_hmac(hash_name, password, salt, iterations, key_length)
 

@@ -44,10 +44,11 @@ class PublicKey:
     _point: Point
 
     def __init__(self, point: Point, curve: Curve = SM2P256V1) -> None:
-        x, y = point
+        if len(point) != 2:
+            raise InvalidKey(f"a point has two coordinates, not {len(point)}")
         for value in point:
             require_int(value, "a coordinate")
-        object.__setattr__(self, "_point", require_point((x, y), curve))
+        object.__setattr__(self, "_point", require_point(point, curve))
         object.__setattr__(self, "_curve", curve)
 
     def __setattr__(self, name: str, value: object) -> NoReturn:

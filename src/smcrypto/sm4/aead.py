@@ -166,7 +166,9 @@ class SM4CCM:
         bytes, authenticated, not contained. Both may be empty. Source: SP 800-38C, 6.1.
         """
         N, P, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
-        Ctr_0 = _counter_block(N, len(P))
+        Ctr_0 = _counter_block(N)
+        if len(P) >= _text_limit(N):
+            raise InvalidLength(f"with a nonce of {len(N)} bytes the data is below {_text_limit(N)}, not {len(P)}")
         S_0, C = self._engine.encrypt_and_ctr_xor(Ctr_0, Ctr_0[:-1] + b"\1", P, 8 * (15 - len(N)))
         return C + self._tag(S_0, N, A, P)
 
@@ -174,11 +176,12 @@ class SM4CCM:
         """The plaintext of `data` = ciphertext ‖ tag; InvalidTag unless all three are as they were sealed.
 
         CCM's tag covers the plaintext, so that is computed first; it is returned only when the tag, compared
-        in constant time, is right. Data shorter than a tag is InvalidTag as well. Source: SP 800-38C, 6.2.
+        in constant time, is right. Data shorter than a tag, or longer than `encrypt` makes it, is InvalidTag as
+        well; a nonce of another length is InvalidLength. Source: SP 800-38C, 6.2.
         """
         N, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
-        Ctr_0 = _counter_block(N, len(data) - self._t)
-        if len(data) < self._t:
+        Ctr_0 = _counter_block(N)
+        if not self._t <= len(data) < self._t + _text_limit(N):
             raise InvalidTag("the message is not authentic")
         C, T = data[: -self._t], data[-self._t :]
         S_0, P = self._engine.encrypt_and_ctr_xor(Ctr_0, Ctr_0[:-1] + b"\1", C, 8 * (15 - len(N)))
@@ -203,14 +206,17 @@ class SM4CCM:
         return xor_bytes(Y, S_0)[: self._t]
 
 
-def _counter_block(N: bytes, text: int) -> bytes:
-    """Ctr_0 (A.3) for a nonce and a length of text, after checking both (5.3, A.1)."""
+def _counter_block(N: bytes) -> bytes:
+    """Ctr_0 (A.3) for a nonce, after checking that (A.1)."""
     if not 7 <= len(N) <= 13:
         raise InvalidLength(f"a CCM nonce is 7 to 13 bytes, not {len(N)}")
     q = 15 - len(N)
-    if text >= 1 << 8 * q:
-        raise InvalidLength(f"with a nonce of {len(N)} bytes CCM takes fewer than 2^{8 * q} bytes, not {text}")
     return bytes([q - 1]) + N + bytes(q)
+
+
+def _text_limit(N: bytes) -> int:
+    """The text is shorter than this: its length has to fit the q bytes that the nonce leaves (5.3)."""
+    return 1 << 8 * (15 - len(N))
 
 
 def _encoded_length(a: int) -> bytes:

@@ -23,23 +23,25 @@ __all__ = ["CBC", "CFB", "CTR", "ECB", "OFB", "XTS", "Cipher", "CipherStream", "
 
 Padding: TypeAlias = Literal["pkcs7"] | None
 
+_PIECE = 1 << 20  # bytes worked on at once: some modes keep several copies of them, and longer is no faster
+
 
 @dataclass(frozen=True, slots=True)
 class ECB:
     """Electronic codebook: every block on its own, so equal blocks show. For key wrapping and tests, not messages."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class CBC:
     """Cipher block chaining. iv: 16 bytes, unpredictable and never used twice with one key; otherwise InvalidLength."""
 
     iv: bytes
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+    def __init__(self, iv: BytesLike) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class CFB:
     """Cipher feedback over whole blocks (CFB-128).
 
@@ -48,21 +50,21 @@ class CFB:
 
     iv: bytes
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+    def __init__(self, iv: BytesLike) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class OFB:
     """Output feedback. iv: 16 bytes, never used twice with one key; otherwise InvalidLength."""
 
     iv: bytes
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "iv", as_exact_bytes(self.iv, "iv", 16))
+    def __init__(self, iv: BytesLike) -> None:
+        object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class CTR:
     """Counter mode. nonce: the first counter block, 16 bytes; otherwise InvalidLength.
 
@@ -72,11 +74,11 @@ class CTR:
 
     nonce: bytes
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "nonce", as_exact_bytes(self.nonce, "nonce", 16))
+    def __init__(self, nonce: BytesLike) -> None:
+        object.__setattr__(self, "nonce", as_exact_bytes(nonce, "nonce", 16))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class XTS:
     """XTS for storage, with ciphertext stealing; takes a 32-byte key and data of at least 16 bytes.
 
@@ -88,9 +90,9 @@ class XTS:
     tweak: bytes
     variant: Variant = "gb"
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "tweak", as_exact_bytes(self.tweak, "tweak", 16))
-        check_variant(self.variant)
+    def __init__(self, tweak: BytesLike, variant: Variant = "gb") -> None:
+        object.__setattr__(self, "tweak", as_exact_bytes(tweak, "tweak", 16))
+        object.__setattr__(self, "variant", check_variant(variant))
 
 
 Mode: TypeAlias = ECB | CBC | CFB | OFB | CTR | XTS
@@ -287,7 +289,9 @@ class CipherStream:
         data = as_bytes(data, "data")
         if self._transform is None:
             raise AlreadyFinalized("this stream was finalized")
-        return self._transform.update(data)
+        if len(data) <= _PIECE:
+            return self._transform.update(data)
+        return b"".join([self._transform.update(data[i : i + _PIECE]) for i in range(0, len(data), _PIECE)])
 
     def finalize(self) -> bytes:
         """Return the rest; InvalidLength or InvalidPadding where the whole does not fit; only once."""
@@ -300,7 +304,7 @@ class CipherStream:
         raise TypeError("streams are neither copied nor pickled: two would go on with one state")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Cipher:
     """A key joined with a mode, GB/T 17964-2021.
 
@@ -317,17 +321,20 @@ class Cipher:
     mode: Mode
     padding: Padding = field(default=None, kw_only=True)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "key", as_bytes(self.key, "key"))
-        if not isinstance(self.mode, Mode):
-            raise TypeError(f"mode must be a mode of sm4, not {type(self.mode).__name__}")
-        if self.padding not in (None, "pkcs7"):
+    def __init__(self, key: BytesLike, mode: Mode, *, padding: Padding = None) -> None:
+        key = as_bytes(key, "key")
+        if not isinstance(mode, Mode):
+            raise TypeError(f"mode must be a mode of sm4, not {type(mode).__name__}")
+        if padding not in (None, "pkcs7"):
             raise InvalidOption('padding must be None or "pkcs7"')
-        if self.padding and not isinstance(self.mode, ECB | CBC):
-            raise InvalidOption(f"{type(self.mode).__name__} takes no padding")
-        length = 32 if isinstance(self.mode, XTS) else 16
-        if len(self.key) != length:
-            raise InvalidKey(f"SM4-{type(self.mode).__name__} takes a key of {length} bytes, not {len(self.key)}")
+        if padding and not isinstance(mode, ECB | CBC):
+            raise InvalidOption(f"{type(mode).__name__} takes no padding")
+        length = 32 if isinstance(mode, XTS) else 16
+        if len(key) != length:
+            raise InvalidKey(f"SM4-{type(mode).__name__} takes a key of {length} bytes, not {len(key)}")
+        object.__setattr__(self, "key", key)
+        object.__setattr__(self, "mode", mode)
+        object.__setattr__(self, "padding", padding)
 
     def encryptor(self) -> CipherStream:
         """A new stream that encrypts."""
@@ -372,7 +379,7 @@ def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = N
     >>> decrypt(key, CBC(iv), sealed, padding="pkcs7")
     b'attack at dawn'
     """
-    stream = Cipher(as_bytes(key, "key"), mode, padding=padding).encryptor()
+    stream = Cipher(key, mode, padding=padding).encryptor()
     return stream.update(data) + stream.finalize()
 
 
@@ -383,5 +390,5 @@ def decrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = N
     end in well-formed padding is InvalidPadding. Do not tell an attacker
     which decryptions fail: that alone reveals CBC plaintext.
     """
-    stream = Cipher(as_bytes(key, "key"), mode, padding=padding).decryptor()
+    stream = Cipher(key, mode, padding=padding).decryptor()
     return stream.update(data) + stream.finalize()

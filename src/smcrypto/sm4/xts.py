@@ -26,10 +26,11 @@ _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _LANES = 64  # tweaks computed at once; alpha^64 is the largest power that _times_alpha takes
 
 
-def check_variant(variant: str) -> None:
-    """InvalidOption unless it is one of the two."""
+def check_variant(variant: Variant) -> Variant:
+    """`variant` itself; InvalidOption unless it is one of the two."""
     if variant not in ("gb", "ieee"):
         raise InvalidOption('variant must be "gb" or "ieee"')
+    return variant
 
 
 @cache

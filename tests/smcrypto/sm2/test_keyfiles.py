@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from der_variants import overfull
-from smcrypto import InvalidKey, InvalidOption, MissingDependency, SMCryptoError, der, pem, sm2, sm4
+from smcrypto import InvalidKey, InvalidOption, MissingDependency, SMCryptoError, der, kdf, pem, sm2, sm3, sm4
 from smcrypto.sm2 import keyfiles
 from vectors_json import load
 
@@ -413,6 +413,7 @@ def test_writing_refuses_what_makes_no_sense() -> None:
 # --- encrypted keys that are refused ---
 
 SHA256 = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
+SM3 = der.sequence(der.oid("1.2.156.10197.1.401.2"))
 
 
 def encrypted(
@@ -504,6 +505,20 @@ def test_encrypted_keys_that_are_refused(case: str) -> None:
     data, reason = WRONG_ENCRYPTED[case]
     with pytest.raises(InvalidKey, match=reason):
         sm2.PrivateKey.from_der(data, b"pw")
+
+
+@pytest.mark.parametrize(("iterations", "engine", "reason"), [
+    (1_000_001, "python", "1000001 PBKDF2 iterations of SM3; without OpenSSL's SM3 the limit is 1000000"),
+    (1_000_001, "openssl", "the password is wrong"),
+    (10_000_001, "openssl", "the limit is 10000000"),
+])
+def test_the_limit_of_iterations_is_a_limit_of_time(
+    iterations: int, engine: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sm3, "ENGINE", engine)
+    monkeypatch.setattr(kdf, "pbkdf2_hmac", lambda password, salt, iterations, length: bytes(length))
+    with pytest.raises(InvalidKey, match=reason):
+        sm2.PrivateKey.from_der(encrypted(iterations=iterations, prf=SM3, hash_name="sm3"), b"pw")
 
 
 FULL = {

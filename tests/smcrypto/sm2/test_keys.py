@@ -58,6 +58,12 @@ def test_public_keys_from_coordinates():
             PublicKey(wrong)
 
 
+def test_a_point_is_two_coordinates():
+    for point in [(), (1,), (1, 2, 3)]:
+        with pytest.raises(InvalidKey, match="two coordinates"):
+            PublicKey(point)
+
+
 def test_generated_keys_are_in_range_and_differ(monkeypatch):
     assert len({PrivateKey.generate().to_int() for _ in range(20)}) == 20
     bounds = []

@@ -304,9 +304,10 @@ def test_tag_lengths_are_integers(bad):
 def test_ccm_refuses_messages_its_counter_cannot_number():
     """A nonce of 13 bytes leaves two for the length (SP 800-38C, A.1)."""
     ccm, nonce = SM4CCM(KEY), bytes(13)
-    for call, data in ((ccm.encrypt, bytes(65536)), (ccm.decrypt, bytes(65536 + 16))):
-        with pytest.raises(InvalidLength):
-            call(nonce, data)
+    with pytest.raises(InvalidLength):
+        ccm.encrypt(nonce, bytes(65536))
+    with pytest.raises(InvalidTag):  # nobody can have sealed that
+        ccm.decrypt(nonce, bytes(65536 + 16))
     longest = bytes(65535)
     assert ccm.decrypt(nonce, ccm.encrypt(nonce, longest)) == longest
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import random
+import tracemalloc
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -285,3 +286,23 @@ def test_all_padding_failures_read_the_same() -> None:
             sm4.decrypt(KEY, sm4.CBC(IV), ciphertext, padding="pkcs7")
         messages.add(str(failure.value))
     assert len(messages) == 1
+
+
+@pytest.mark.parametrize("mode", ALL, ids=name)
+def test_memory_stays_within_a_small_multiple_of_the_input(mode: sm4.Mode) -> None:
+    """And what is worked on in several pieces is the same as what comes in several."""
+    key = random.Random(7).randbytes(32 if isinstance(mode, sm4.XTS) else 16)
+    data = random.Random(8).randbytes((5 << 19) + 16)
+    sealed = sm4.encrypt(key, mode, data)  # tables and planes are made by now
+    stream = sm4.Cipher(key, mode).encryptor()
+    assert b"".join(stream.update(data[i : i + 100_000]) for i in range(0, len(data), 100_000)) + stream.finalize() == (
+        sealed
+    )
+    tracemalloc.start()
+    try:
+        opened = sm4.decrypt(key, mode, sealed)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert opened == data
+    assert peak < 4.5 * len(data) + (6 << 20), peak / len(data)
