@@ -39,6 +39,7 @@ from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot import assembly as robot_assembly
 from rosbridge_eth.robot.clock import certificate_clock, clock_synchronised
+from rosbridge_eth.robot.sender import mend as mend_of
 from rosbridge_eth.server.administration import load_ca
 from rosbridge_eth.server.assembly import bound_contract, open_chain, open_inbox, open_journal
 from rosbridge_eth.sources import open_source
@@ -47,6 +48,7 @@ from rosbridge_eth.store.peek import peek_spool
 OLDEST_PYTHON = (3, 11)
 PACKAGES = ("pydantic", "eth_account", "web3", "rosbags", "redis", "prometheus_client", "rich", "typer")
 HANDSHAKE_TIME = 6.0  # seconds for a server to answer
+ATTEMPT_TIME = 2.5  # seconds for one attempt; what a server says of a refusal is known when it ends
 EXPIRY = timedelta(days=30)
 LITTLE_ROOM = 1 << 30  # bytes
 _ETH = 10**18
@@ -410,8 +412,8 @@ def _handshake(home: RobotHome, config: RobotConfig, opened: Sequence[Identity])
     events: list[Event] = []
     now = time.monotonic()
     client = Client(
-        ClientConfig(mode=robot_assembly.MODES[config.channel]), opened[0], Trust(roots), end.server_name, now,
-        wall=certificate_clock(home),
+        ClientConfig(mode=robot_assembly.MODES[config.channel], attempt_timeout=ATTEMPT_TIME), opened[0], Trust(roots),
+        end.server_name, now, wall=certificate_clock(home),
     )
     loop = UdpLoop(client, sock, events.append)
     client.connect(address, now)
@@ -426,13 +428,17 @@ def _handshake(home: RobotHome, config: RobotConfig, opened: Sequence[Identity])
     if any(isinstance(event, Connected) for event in events):
         yield ok("server", f"{place} made a session in {took * 1000:.0f} ms")
         return
-    failures = [event.why for event in events if isinstance(event, HandshakeFailed)]
-    why = failures[-1] if failures else "no answer"
+    failures = [e for e in events if isinstance(e, HandshakeFailed)] or [HandshakeFailed("no answer")]
+    # One attempt may have lost what another was told.
+    failure = next((event for event in reversed(failures) if event.hint is not None), failures[-1])
     if client.statistics().datagrams_received == 0:
-        mend = f"is the server up, its `public` address right, UDP port {place.port} open in every firewall between?"
+        mend = (
+            f"is the server up, its `public` address right, UDP port {place.port} open in every firewall between, and"
+            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
+        )
     else:
-        mend = "it answers and refuses; `status` at the operator's home says whether this robot is in force"
-    yield broken("server", f"{place}: {why}", mend)
+        mend = mend_of(failure, config.channel)
+    yield broken("server", f"{place}: {failure.why}", mend)
 
 
 # ---------------------------------------------------------------------- a reader's folder

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -10,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+import rosbridge_eth
 from bridge.test_cli import Capture, fails, made, place
 from rosbridge_eth.bundle import open_bundle
 from rosbridge_eth.capture import RawMessage
@@ -74,3 +78,43 @@ def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Path, monkeyp
 
 def test_usage_is_still_told_by_its_own_code(place: Path) -> None:
     assert run(["read"]) == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("home, whose", [("operator", "an operator's"), ("operator/readers/owner", "a reader's")])
+def test_a_robot_does_not_move_into_a_home_of_another_kind(
+    place: Path, home: str, whose: str, capsys: Capture
+) -> None:
+    before = {path: path.read_bytes() for path in Path("operator").rglob("*") if path.is_file()}
+    fails(capsys, ExitCode.CONFIG, f"{home} is {whose} home", "join", BUNDLE, "--home", home, "--password-file", "word")
+    assert {path: path.read_bytes() for path in Path("operator").rglob("*") if path.is_file()} == before
+
+
+def test_ctrl_c_while_the_packages_load_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    source = str(Path(rosbridge_eth.__file__).parents[1])
+    process = subprocess.run(
+        [sys.executable, "-m", "rosbridge_eth", "status"], capture_output=True, text=True, timeout=60, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), source])},
+    )
+    assert (process.returncode, process.stderr) == (130, "rosbridge-eth: interrupted\n")
+
+
+@pytest.mark.parametrize("emptied", [False, True])
+@pytest.mark.parametrize("command", [
+    ("status",), ("register", "robot_2", "--password-file", "word"), ("revoke", "robot_1"),
+    ("reader", "analyst", "--password-file", "word"), ("renew",), ("export", "robot_1", "keystore.json"),
+])
+def test_a_lost_registry_is_told_and_nothing_is_built_upon_an_empty_one(
+    place: Path, command: tuple[str, ...], emptied: bool, capsys: Capture
+) -> None:
+    registry = Path("operator/registry.sqlite")
+    for part in Path("operator").glob("registry.sqlite*"):
+        part.unlink()
+    if emptied:
+        registry.touch()
+    before = sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry"))
+    more = () if command == ("status",) else ("--passphrase-file", "pass")
+    error = fails(capsys, ExitCode.STORE, "restore registry.sqlite from your backup", *command, *more)
+    assert len(error.splitlines()) == 1
+    assert registry.exists() == emptied
+    assert sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry")) == before

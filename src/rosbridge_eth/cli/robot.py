@@ -81,8 +81,4 @@ def robot(
     talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
     with monitored(running, settings.monitor) as on_turn:
         running.run(on_turn=on_turn)
-    counts = running.sender.statistics
-    kept = running.spool_left
-    missed = f", {running.dropped} dropped because they came too fast" if running.dropped else ""
-    captured = running.recorder.times.records
-    talk(f"{captured} captured{missed}, {counts.stored} stored by the server, {kept} kept for later.")
+    talk(running.summary())

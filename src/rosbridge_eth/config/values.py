@@ -12,7 +12,7 @@ sentence that begins with the key.
 from __future__ import annotations
 
 import re
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -102,6 +102,12 @@ def duration_text(seconds: float) -> str:
         if seconds >= length and seconds % length == 0:
             return f"{round(seconds / length)}{unit}"
     return f"{round(seconds * 1000)}ms"
+
+
+def time_text(nanoseconds: int) -> str:
+    """As a person writes it, to the millisecond."""
+    moment = _EPOCH + timedelta(milliseconds=nanoseconds // 10**6)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def size_text(size: int) -> str:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 from rosbridge_eth.bundle import Bundle
-from rosbridge_eth.capture import Capture, CapturedRecord
+from rosbridge_eth.capture import Capture, CapturedRecord, TopicRule
 from rosbridge_eth.channel import Client, ClientConfig, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
 from rosbridge_eth.config import Address, RobotConfig
+from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ConfigError, IdentityError
-from rosbridge_eth.home import BridgeEnd, RobotHome, write_atomically
+from rosbridge_eth.home import BridgeEnd, OperatorHome, ReaderHome, RobotHome, write_atomically
 from rosbridge_eth.identity import (
     Identity,
     Role,
@@ -29,9 +31,11 @@ from rosbridge_eth.robot.process import Robot
 from rosbridge_eth.robot.recorder import Recorder
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.sealing import Sealer, StreamLimits
-from rosbridge_eth.sources import open_source
+from rosbridge_eth.sources import BagSource, open_source
 from rosbridge_eth.store import Spool, SpoolLimits
 from smcrypto import sm2, x509
+
+log = logging.getLogger(__name__)
 
 MODES = {"exchange": Mode.EXCHANGE, "transport": Mode.TRANSPORT}
 FIRST_CONFIG = """\
@@ -46,6 +50,12 @@ def join(home: RobotHome, bundle: Bundle, password: bytes, keys: Path | None = N
         raise ConfigError(
             f"{home.path} is the home of robot {home.bridge().robot!r} already; choose another folder"
         )
+    others = {"an operator's": OperatorHome(home.path).config, "a reader's": ReaderHome(home.path).config}
+    for whose, config in others.items():
+        if config.exists():
+            raise ConfigError(
+                f"{home.path} is {whose} home, where a robot's files do not belong; choose another folder"
+            )
     files = {name: content.encode() for name, content in bundle.identity.items()}
     for name in ("sign.key.pem", "enc.key.pem"):
         if name not in files:
@@ -106,6 +116,8 @@ def open_robot(
     for topic, decoders in source.decoders().items():
         for decoder in decoders:
             capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message
+    if isinstance(source, BagSource):
+        _say_what_is_outside(config.rules(), source.span)
     spool = Spool(
         home.spool,
         identity.public.robot_id,
@@ -122,6 +134,7 @@ def open_robot(
         client,
         spool,
         release=config.acknowledge,
+        channel=config.channel,
         before_sending=lambda: recorder.declare_dropped(wall_ns=time.time_ns(), now=time.monotonic()),
         on_server_time=home.raise_clock_floor,
     )
@@ -132,6 +145,25 @@ def open_robot(
         source=source, recorder=recorder, sender=sender, spool=spool, client=client, loop=loop,
         on_captured=on_captured,
     )
+
+
+def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> None:
+    """A rule that nothing in a recording can meet captures nothing, and would do so without a word."""
+    first, last = span
+    if first > last:
+        return  # the source has said that it replays nothing
+    for rule in rules:
+        key = (
+            "at" if rule.at_ns is not None and rule.at_ns > last
+            else "from" if rule.from_ns is not None and rule.from_ns > last
+            else "until" if rule.until_ns is not None and rule.until_ns <= first
+            else None
+        )
+        if key is not None:
+            log.warning(
+                "%s: `%s` leaves nothing to capture: what is replayed of the recording goes from %s to %s",
+                rule.topic, key, time_text(first), time_text(last),
+            )
 
 
 def parse_server(text: str) -> Address:

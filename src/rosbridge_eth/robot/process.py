@@ -67,6 +67,29 @@ class Robot:
         """Messages of a live source that this robot was too slow to capture, so far."""
         return sum(self._source.dropped.values())
 
+    def summary(self) -> str:
+        """What became of everything, in one line; to be asked after `run`."""
+        sender, spool = self.sender.statistics, self.spool.statistics
+        lost = {
+            "dropped because they came too fast": self.dropped,
+            "left out as too large or undecodable": self.recorder.left_out,
+            "not kept for want of room": self.recorder.refused,
+            "superseded by newer ones": spool.superseded,
+            "dropped from the full spool": spool.dropped,
+            "refused by the server": sender.refused + sender.conflicts,
+        }
+        parts = [f"{self.recorder.times.records} captured"]
+        parts += [f"{count} {what}" for what, count in lost.items() if count]
+        parts += [f"{sender.stored} stored by the server", f"{self.spool_left} kept for later"]
+        line = ", ".join(parts)
+        if not self.spool_left:
+            return f"{line}."
+        if sender.refusal is not None:
+            return f"{line}: {sender.refusal}."
+        if not sender.sessions:
+            return f"{line}: there was no session yet when it was stopped."
+        return f"{line}: it was stopped before the server had them; the next start sends them."
+
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
 

@@ -67,6 +67,12 @@ class Recorder:
         times.spool += kept - encrypted
         return captured
 
+    @property
+    def left_out(self) -> int:
+        """Messages that were due and could not become a record: too large, of another type, or not to be decoded."""
+        topics = self._capture.statistics().values()
+        return self.too_large + sum(topic.refused + topic.undecodable for topic in topics)
+
     def declare_dropped(self, *, wall_ns: int, now: float) -> bool:
         """Seal a gap record for what the spool had to drop, if there is anything to declare."""
         return self._spool.declare(lambda ranges: self._seal_gap(ranges, wall_ns), now)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rosbridge_eth import protocol
-from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, MessageAnswered
+from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, MessageAnswered, Reason
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.protocol import (
     Ack,
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 BUSY_PAUSE = 1.0  # seconds without sending after the server had no room
 CHECK_EVERY = 0.5  # seconds between rounds of asking whether stored records are confirmed
 CHECKS_AT_ONCE = 128
+SAY_AGAIN = 60.0  # seconds before the same reason for having no session is said once more
 _LOST = {"unknown"}  # the server lost the record after acknowledging it: send it again
 
 
@@ -48,7 +49,29 @@ class SenderStatistics:
     sessions: int = 0
     connected: bool = False
     trouble: str | None = None
+    refusal: str | None = None
+    """Why there has been no session since the last one, and what to do about it."""
     registration: Registration | None = None
+
+
+def mend(failure: HandshakeFailed, channel: str) -> str:
+    """What to do about a session that did not come about; `channel` is the configured mode."""
+    match failure.hint:
+        case Reason.NOT_ALLOWED | Reason.CERTIFICATE:
+            return (
+                "ask the operator, whose `status` says whether this robot is in force; if it was revoked or replaced,"
+                " have it registered again (`register --replace`) and `join` the new bundle in a new folder: records"
+                " sealed under a replaced identity cannot be delivered"
+            )
+        case Reason.EXPIRED:
+            return "see to this machine's clock; if the certificates have expired, have the robot registered again"
+        case Reason.FULL:
+            return "wait, or ask the operator for more [limits] connections"
+        case _:
+            return (
+                "is it up, is the address right, is UDP let through, and does it take"
+                f' channel = "{channel}" (`channel` in its server.toml)? `doctor` at this home tries it'
+            )
 
 
 class Sender:
@@ -56,6 +79,7 @@ class Sender:
 
     before_sending: called on a live session before records are taken; the
     robot declares dropped records there.
+    channel: the configured mode, for what is said where no session comes about.
     on_server_time: given the server's authenticated time (seconds since 1970) at each new session.
     """
 
@@ -65,11 +89,14 @@ class Sender:
         spool: Spool,
         *,
         release: Literal["stored", "confirmed"] = "stored",
+        channel: str = "exchange",
         before_sending: Callable[[], object] = lambda: None,
         on_server_time: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         self._client, self._spool = client, spool
         self._wait_for_chain = release == "confirmed"
+        self._channel = channel
+        self._said: dict[str, float] = {}  # reason for having no session -> when it was said
         self._before_sending, self._on_server_time = before_sending, on_server_time
         self._records: dict[int, RecordId] = {}  # message id -> record waiting for its acknowledgement
         self._checks: dict[int, RecordId] = {}
@@ -128,7 +155,7 @@ class Sender:
             case Connected(peer=peer, server_time=server_time):
                 self.statistics.sessions += 1
                 self.statistics.connected = True
-                self.statistics.trouble = None
+                self.statistics.trouble = self.statistics.refusal = None
                 log.info("connected to %s", peer)
                 if server_time is not None:
                     self._on_server_time(server_time.timestamp())
@@ -141,9 +168,11 @@ class Sender:
                 self._checks.clear()
                 self._register = None
             case HandshakeFailed(why=why):
-                if why != self.statistics.trouble:  # said once, not at every attempt
-                    log.warning("no session: %s", why)
                 self.statistics.trouble = why
+                self.statistics.refusal = f"{why}; {mend(event, self._channel)}"
+                if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:  # not at every attempt
+                    self._said[why] = now
+                    log.warning("no session: %s", self.statistics.refusal)
             case MessageAnswered(message_id=message, payload=payload):
                 try:
                     self._answered(message, payload, now)

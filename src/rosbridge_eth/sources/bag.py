@@ -76,7 +76,7 @@ class BagSource:
                 for connection in reader.connections
             ]
             self._distribution = reader.ros_distro if isinstance(reader, Rosbag2Reader) else None
-            self._start = reader.start_time
+            self._start, self._end = reader.start_time, reader.end_time
         try:
             self._offers = self._read_offers()
             watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
@@ -84,6 +84,27 @@ class BagSource:
         except SourceError:
             self.close()
             raise
+        self._say_if_nothing_is_replayed()
+
+    def _say_if_nothing_is_replayed(self) -> None:
+        first, last = self.span
+        if self._end <= self._start:
+            log.warning("%s holds no message", self._where)
+        elif first > last:
+            lasts = (self._end - 1 - self._start) / 1e9
+            log.warning(
+                "%s: nothing is replayed: start = %gs is after its last message; the recording lasts %.3f s",
+                self._where, self._settings.start_ns / 1e9, lasts,
+            )
+
+    @property
+    def span(self) -> tuple[int, int]:
+        """When the first and the last message can have been received that are replayed (ns since 1970).
+
+        The first is the later one where nothing is.
+        """
+        stop = self._end if self._settings.stop_ns is None else min(self._end, self._start + self._settings.stop_ns)
+        return self._start + self._settings.start_ns, stop - 1
 
     def offers(self) -> Sequence[Offer]:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""

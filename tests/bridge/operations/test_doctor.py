@@ -93,7 +93,17 @@ def test_a_revoked_robot_learns_that_it_is_refused_rather_than_unheard(
     registry.close()
     code, findings = doctor(capsys, "--home", "robot", "--passphrase-file", "word")
     assert code == ExitCode.FAILED
-    assert "in force" in of(findings, "server")["mend"]
+    assert "in force" in of(findings, "server")["mend"] and "register --replace" in of(findings, "server")["mend"]
+    assert "allow list" in of(findings, "server")["found"] and "no answer" not in of(findings, "server")["found"]
+
+
+def test_a_mode_that_the_server_does_not_take_is_among_what_to_look_at(
+    place: Place, server: Address, capsys: Capture
+):
+    place.robot.config.write_text('channel = "transport"\n' + place.robot.config.read_text())
+    code, findings = doctor(capsys, "--home", "robot", "--passphrase-file", "word")
+    assert code == ExitCode.FAILED
+    assert 'channel = "transport"' in of(findings, "server")["mend"]
 
 
 def test_a_server_that_is_not_there_is_told_with_what_to_look_at(place: Place, capsys: Capture):
