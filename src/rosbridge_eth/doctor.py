@@ -96,8 +96,11 @@ def examine(checks: Iterable[tuple[str, Check]]) -> Iterator[Finding]:
         try:
             yield from check()
         except BridgeError as error:
-            found, _, mend = str(error).partition("; ")
-            yield broken(what, found, mend or "see the sentence before")
+            text = str(error)
+            found, _, mend = text.partition("; ")
+            if not mend:  # two sentences, the second of which says what to do
+                found, _, mend = text.partition(". ")
+            yield broken(what, found, mend or "correct what this names")
 
 
 def checks_of(path: Path, kind: HomeKind, passphrase: bytes | None) -> list[tuple[str, Check]]:

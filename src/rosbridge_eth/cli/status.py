@@ -5,8 +5,10 @@ from __future__ import annotations
 import http.client
 import json as jsonlib
 import time
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +18,12 @@ from rosbridge_eth.cli.output import Json, data, print_json, table, talk
 from rosbridge_eth.config import load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.identity import Role
+from rosbridge_eth.ledger.states import Kind
+from rosbridge_eth.records import robot_id
+
+if TYPE_CHECKING:
+    from rosbridge_eth.registry import Enrolment
 
 _ETH = 10**18
 _ASK = 3.0  # seconds for a monitor to answer
@@ -36,7 +44,10 @@ def status(
     robot_home: Annotated[Path | None, typer.Option(help="A robot's folder; --home finds out by itself, too.")] = None,
     json: Json = False,
 ) -> None:
-    """What is where: names, queues, ages, drops, dead letters, balances, the last block. Also of a robot's home."""
+    """What is where: names, queues, ages, drops, dead letters, balances, the last block. Also of a robot's home.
+
+    Exits with 7 where the node is on another chain than the contract; one that does not answer is only told.
+    """
     place = robot_home or home
     kind = kind_of(place)
     match kind:
@@ -50,6 +61,8 @@ def status(
         print_json({"kind": kind, **report})
     else:
         show(report)
+    if "wrong_chain" in report:
+        raise ChainError(report["wrong_chain"])
 
 
 def _monitor(address: tuple[str, int] | None, which: str) -> dict[str, Any] | None:
@@ -112,7 +125,7 @@ def _monitor_rows(running: dict[str, Any] | None) -> list[tuple[str, object]]:
 
 def _operator(place: OperatorHome) -> dict[str, Any]:
     from rosbridge_eth.registry import Registry
-    from rosbridge_eth.server.assembly import open_chain, open_inbox, open_journal
+    from rosbridge_eth.server.assembly import bound_contract, open_chain, open_inbox, open_journal
 
     config = load_server_config(place.config)
     registry = Registry(place.registry)
@@ -139,6 +152,7 @@ def _operator(place: OperatorHome) -> dict[str, Any]:
                       "bytes": held.bytes, "oldest_seconds": held.oldest_age},
             "batches": {str(state): count for state, count in journal.counts().items()},
             "dead_letters": journal.count_dead_letters(),
+            "waiting_batches": _waiting(journal, names),
         }
     finally:
         inbox.close()
@@ -146,6 +160,10 @@ def _operator(place: OperatorHome) -> dict[str, Any]:
     node = open_chain(config)
     try:
         head = node.head()
+        try:
+            bound_contract(node, deployment)
+        except ChainError as failure:
+            return report | {"wrong_chain": str(failure)}
         report["block"] = head.number
         report["block_age_seconds"] = max(0.0, time.time() - head.timestamp)
         operator = jsonlib.loads(place.accounts.read_bytes())["operator"]
@@ -157,6 +175,19 @@ def _operator(place: OperatorHome) -> dict[str, Any]:
     finally:
         node.close()
     return report
+
+
+def _waiting(journal: ledger.Journal, names: Sequence[Enrolment]) -> list[dict[str, Any]]:
+    """The batches that are not settled, by robot, and what keeps them as far as this home knows."""
+    robots = {robot_id(n.name): n.name for n in names if n.role == Role.ROBOT}
+    in_force = {n.name for n in names if n.role == Role.ROBOT and n.revoked_at is None}
+    counts = Counter(job.robot for job in journal.jobs() if job.kind is Kind.BATCH)
+    return [
+        {"robot": robots.get(tk, tk.hex()), "batches": count,
+         "why": "for the chain" if robots.get(tk) in in_force else "revoked: the contract takes nothing of it"
+                if tk in robots else "not in the registry"}
+        for tk, count in counts.items()
+    ]
 
 
 def _print_operator(report: dict[str, Any]) -> None:
@@ -178,6 +209,8 @@ def _print_operator(report: dict[str, Any]) -> None:
     block = "the node does not answer"
     if "block" in report:
         block = f"{report['block']}, {report['block_age_seconds']:.0f} s old"
+    elif "wrong_chain" in report:
+        block = "the node is on another chain"
     rows2 = [
         ("contract", report["contract"]),
         ("chain", report["chain"]),
@@ -185,6 +218,8 @@ def _print_operator(report: dict[str, Any]) -> None:
         ("inbox waiting", f"{inbox['waiting'] + inbox['leased']} (oldest {oldest}), {inbox['bytes'] / 1024:.0f} KiB"),
         ("dead letters", inbox["dead"] + report["dead_letters"]),
         *((f"batches {state}", count) for state, count in report["batches"].items()),
+        *((f"of {each['robot']} wait", f"{each['batches']} batches ({each['why']})")
+          for each in report["waiting_batches"]),
     ]
     data.print(table("Ledger", ["what", "value"], rows2))
     if "node" in report:
@@ -246,6 +281,10 @@ def _reader(place: ReaderHome) -> dict[str, Any]:
     node = ledger.connect(config.chain)
     try:
         report |= {"node": node.url, "chain": node.chain_id(), "block": node.head().number}
+        try:
+            ledger.Contract.at(node, config.contract)
+        except ChainError as failure:
+            report["wrong_chain"] = str(failure)
     except ChainError as failure:
         report["failure"] = str(failure)
     finally:
@@ -253,7 +292,10 @@ def _reader(place: ReaderHome) -> dict[str, Any]:
     return report
 
 
+_SAID = ("failure", "wrong_chain")  # as sentences, after the table
+
+
 def _print_reader(report: dict[str, Any]) -> None:
-    data.print(table("Reader", ["what", "value"], [(k, v) for k, v in report.items() if k != "failure"]))
+    data.print(table("Reader", ["what", "value"], [(k, v) for k, v in report.items() if k not in _SAID]))
     if "failure" in report:
         talk(report["failure"])

@@ -13,11 +13,14 @@ from typing import Any
 import pytest
 
 from bridge.operations.conftest import PASSPHRASE, PASSWORD, Place
+from rosbridge_eth import ledger
 from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_robot_config, load_server_config
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import Role, Trust, read_certificates
+from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.ledger.embedded import EmbeddedChain
 from rosbridge_eth.records import RecordId, SealedRecord, robot_id
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot.assembly import open_robot
@@ -212,3 +215,57 @@ def test_a_renewed_server_is_still_the_server_its_robots_know(place: Place, caps
     assert run(["renew", "--passphrase-file", "word"]) == ExitCode.IDENTITY
     assert "Traceback" not in capsys.readouterr().err
     assert load_server_identity(place.operator, PASSPHRASE).name == "server", "a wrong passphrase changes nothing"
+
+
+@pytest.fixture
+def made_anew(place: Place, monkeypatch: pytest.MonkeyPatch) -> EmbeddedChain:
+    """What a local chain is after it was started without its state: the same id, another first block."""
+    chain = EmbeddedChain(fund={Keyring.load(place.operator.accounts, PASSPHRASE).operator.address: 10**20})
+    assert chain.chain_id() == place.chain.chain_id()
+    monkeypatch.setattr(ledger, "connect", lambda url, **more: chain)
+    return chain
+
+
+def test_status_says_that_the_node_is_on_another_chain_and_still_shows_the_rest(
+    place: Place, made_anew: EmbeddedChain, capsys: Capture
+):
+    assert run(["status"]) == ExitCode.CHAIN
+    shown = capsys.readouterr()
+    assert "robot_1" in shown.out and "the node is on another chain" in shown.out
+    assert "is another chain with the id" in shown.err and "make a new home" in shown.err
+    assert run(["status", "--json"]) == ExitCode.CHAIN
+    report = json.loads(capsys.readouterr().out)
+    assert "another chain" in report["wrong_chain"]
+    assert report["inbox"]["waiting"] == 0 and "balances" not in report and "block" not in report
+    assert run(["status", "--home", "operator/readers/owner"]) == ExitCode.CHAIN
+    assert place.operator.deployment().contract in capsys.readouterr().err
+
+
+def test_on_the_right_chain_status_is_content(place: Place, monkeypatch: pytest.MonkeyPatch, capsys: Capture):
+    monkeypatch.setattr(ledger, "connect", lambda url, **more: place.chain)
+    for home in ("operator", "operator/readers/owner"):
+        assert run(["status", "--home", home, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["block"] == place.chain.head().number
+
+
+def test_doctor_has_a_mend_for_another_chain(place: Place, made_anew: EmbeddedChain, capsys: Capture):
+    code, findings = doctor(capsys, "--passphrase-file", "pass")
+    assert code == ExitCode.FAILED
+    [found] = [f for f in findings if f["result"] == "broken"]
+    assert "another chain" in found["found"] and "make a new home" in found["mend"]
+
+
+def test_status_says_whose_batches_wait_and_why(place: Place, capsys: Capture):
+    registry = Registry(place.operator.registry)
+    registry.revoke("robot", "robot_1", datetime.now(UTC))
+    registry.close()
+    journal = open_journal(place.operator, place.operator.deployment())
+    records = [SealedRecord(RecordId(robot_id(name), bytes(16), 0), bytes(100)) for name in ("robot_1", "stranger")]
+    journal.seal([[record] for record in records], 0.0)
+    journal.close()
+    assert run(["status", "--json"]) == 0
+    waiting = json.loads(capsys.readouterr().out)["waiting_batches"]
+    assert {each["robot"]: (each["batches"], each["why"].partition(":")[0]) for each in waiting} == {
+        "robot_1": (1, "revoked"), robot_id("stranger").hex(): (1, "not in the registry")}
+    assert run(["status"]) == 0
+    assert "of robot_1 wait" in capsys.readouterr().out
