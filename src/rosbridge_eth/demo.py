@@ -29,12 +29,11 @@ from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.ledger.embedded import EmbeddedChain
 from rosbridge_eth.ledger.submitter import BatchTiming
 from rosbridge_eth.reader import Choice, Reading, ReadRecord, read_robot
-from rosbridge_eth.registry import Registry
+from rosbridge_eth.registry import OWNER, Registry
 from rosbridge_eth.relay import Harm, Relay
 from rosbridge_eth.robot import assembly as robot_assembly
 from rosbridge_eth.robot.process import Robot
 from rosbridge_eth.server.administration import (
-    OWNER,
     deploy_contract,
     init_home,
     load_ca,

@@ -16,6 +16,9 @@ from pathlib import Path
 
 from rosbridge_eth.errors import IdentityError, StoreError
 
+OWNER = "owner"
+"""The reader that `init` makes."""
+
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS enrolment (
     number        INTEGER PRIMARY KEY,   -- order of enrolment; also the index of the account's derivation path
@@ -46,16 +49,52 @@ class Enrolment:
 
 
 class Registry:
-    """The enrolments of one operator's home; safe to open from several processes."""
+    """The enrolments of one operator's home; safe to open from several processes.
 
-    def __init__(self, path: Path) -> None:
+    new: make it, for a home that begins. Otherwise StoreError where it is missing, or lacks the identities that every
+    home begins with: it was lost, and taken for a new one it would refuse every robot.
+    """
+
+    def __init__(self, path: Path, *, new: bool = False) -> None:
+        self._path = path
+        self._file = None if new else self._file_now()
         try:
-            self._db = sqlite3.connect(path, timeout=10, isolation_level=None, check_same_thread=False)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=FULL")
-            self._db.executescript(SCHEMA)
+            self._db = sqlite3.connect(
+                f"{path.absolute().as_uri()}?mode={'rwc' if new else 'rw'}",
+                uri=True, timeout=10, isolation_level=None, check_same_thread=False,
+            )
         except sqlite3.Error as error:
-            raise StoreError(f"the registry {path} cannot be opened ({error}); restore it from a backup") from error
+            raise StoreError(self._lost(f"it cannot be opened as a database, {error}")) from error
+        try:
+            self._begin(new)
+        except sqlite3.Error as error:
+            self._db.close()
+            raise StoreError(self._lost(f"it cannot be used as a database, {error}")) from error
+        except BaseException:
+            self._db.close()
+            raise
+
+    def _begin(self, new: bool) -> None:
+        self._db.execute("PRAGMA journal_mode=WAL")
+        self._db.execute("PRAGMA synchronous=FULL")
+        self._db.executescript(SCHEMA)
+        if new:
+            self._file = self._file_now()
+            return
+        found = set(self._db.execute("SELECT DISTINCT role, name FROM enrolment WHERE role IN ('server', 'reader')"))
+        if ("reader", OWNER) not in found or not any(role == "server" for role, _ in found):
+            raise StoreError(self._lost("it lacks the server and the owner, whom `init` enrolled"))
+
+    def _file_now(self) -> tuple[int, int]:
+        """Which file stands at the path; StoreError if there is none."""
+        try:
+            found = self._path.stat()
+        except OSError as error:
+            raise StoreError(self._lost(error.strerror or str(error))) from error
+        return found.st_dev, found.st_ino
+
+    def _lost(self, why: str) -> str:
+        return f"the registry {self._path} was lost or damaged ({why}): restore {self._path.name} from your backup"
 
     def close(self) -> None:
         self._db.close()
@@ -71,7 +110,15 @@ class Registry:
         self._db.execute("COMMIT")
 
     def revision(self) -> tuple[int, int]:
-        """Another value after every change, whichever process made it; cheap, so readers can keep what they read."""
+        """Another value after every change, whichever process made it; cheap, so readers can keep what they read.
+
+        StoreError where another file, or none, stands at the path by now: changes would be made there and never seen.
+        """
+        if self._file_now() != self._file:
+            raise StoreError(
+                f"the registry {self._path} was replaced by another file while it was open, and what is in that one is"
+                " not known here; end this process and start it again"
+            )
         (others,) = self._db.execute("PRAGMA data_version").fetchone()
         return int(others), self._db.total_changes
 

@@ -24,6 +24,7 @@ from rosbridge_eth.home import OperatorHome, RobotHome
 from rosbridge_eth.identity import Role, load_identity
 from rosbridge_eth.robot.assembly import join, open_robot
 from rosbridge_eth.robot.clock import certificate_clock
+from rosbridge_eth.server.administration import load_ca, renew_server
 
 __all__ = ["made", "place"]  # fixtures
 
@@ -118,3 +119,14 @@ def test_a_lost_registry_is_told_and_nothing_is_built_upon_an_empty_one(
     assert len(error.splitlines()) == 1
     assert registry.exists() == emptied
     assert sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry")) == before
+
+
+def test_the_server_is_renewed_twice_within_a_second(place: Path) -> None:
+    home, now = OperatorHome(Path("operator")), datetime.now(UTC)
+    ca = load_ca(home, b"operator's")
+    first = load_identity(home.server, b"operator's")[0].signing_certificate
+    kept = [renew_server(home, ca=ca, passphrase=b"operator's", now=now) for _ in range(3)]
+    assert len(set(kept)) == 3
+    assert load_identity(kept[0], b"operator's")[0].signing_certificate.to_der() == first.to_der()
+    assert load_identity(home.server, b"operator's")[0].role is Role.SERVER
+    assert not [path.name for path in home.path.iterdir() if "new" in path.name]

@@ -15,12 +15,16 @@ NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
-    return Registry(tmp_path / "registry.sqlite")
+    """As `init` leaves it."""
+    made = Registry(tmp_path / "registry.sqlite", new=True)
+    for mark, role, name in ((254, "server", "server"), (255, "reader", "owner")):
+        enrol(made, name, mark, role=role)
+    return made
 
 
-def enrol(registry: Registry, name: str, mark: int, *, replace: bool = False) -> Enrolment:
+def enrol(registry: Registry, name: str, mark: int, *, role: str = "robot", replace: bool = False) -> Enrolment:
     return registry.enrol(
-        number=registry.next_number(), role="robot", name=name, fingerprint=bytes([mark]) * 32,
+        number=registry.next_number(), role=role, name=name, fingerprint=bytes([mark]) * 32,
         certificates=b"pem", account=f"0x{mark}", now=NOON, replace=replace,
     )
 
@@ -69,3 +73,41 @@ def test_a_file_that_is_no_database_is_refused_with_the_way_out(tmp_path: Path) 
     (tmp_path / "registry.sqlite").write_bytes(b"not a database" * 100)
     with pytest.raises(StoreError, match="backup"):
         Registry(tmp_path / "registry.sqlite")
+
+
+@pytest.mark.parametrize("harm", ["deleted", "emptied", "made anew", "of another robot"])
+def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry, tmp_path: Path, harm: str) -> None:
+    enrol(registry, "robot_1", 1)
+    registry.close()
+    path = tmp_path / "registry.sqlite"
+    path.unlink()
+    if harm == "emptied":
+        path.touch()
+    if harm in ("made anew", "of another robot"):
+        made = Registry(path, new=True)
+        if harm == "of another robot":
+            enrol(made, "robot_4", 4)
+        made.close()
+    with pytest.raises(StoreError, match=r"restore registry\.sqlite from your backup"):
+        Registry(path)
+    assert path.exists() == (harm != "deleted")
+
+
+def test_a_home_whose_server_and_owner_were_replaced_has_its_registry_still(registry: Registry, tmp_path: Path) -> None:
+    enrol(registry, "server", 7, role="server", replace=True)
+    registry.revoke("reader", "owner", NOON)
+    registry.close()
+    Registry(tmp_path / "registry.sqlite").close()
+
+
+def test_a_registry_deleted_or_replaced_while_it_is_open_is_noticed(registry: Registry, tmp_path: Path) -> None:
+    path = tmp_path / "registry.sqlite"
+    registry.revision()
+    copy = tmp_path / "copy"
+    copy.write_bytes(path.read_bytes())
+    path.unlink()
+    with pytest.raises(StoreError, match="restore"):
+        registry.revision()
+    copy.rename(path)
+    with pytest.raises(StoreError, match="replaced"):
+        registry.revision()

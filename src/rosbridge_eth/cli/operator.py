@@ -143,7 +143,7 @@ def register(
         node.close()
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if made.given_up:
-        talk(f"{made.given_up} records that the revoked {name} had handed over are now dead letters in {place.journal}.")
+        talk(f"{made.given_up} records of the revoked {name} are dead letters in {place.journal} now.")
     talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
 
 

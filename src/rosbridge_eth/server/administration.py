@@ -7,12 +7,14 @@ chain is ordered so that it can be run again after a crash between any two.
 
 from __future__ import annotations
 
-import logging
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import chain as one_after_another
+from itertools import count
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -40,15 +42,14 @@ from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.ledger.journal import Attempt, Binding
 from rosbridge_eth.reading import join_certificates
 from rosbridge_eth.records import robot_id
-from rosbridge_eth.registry import Enrolment, Registry
+from rosbridge_eth.registry import OWNER, Enrolment, Registry
 from rosbridge_eth.server.assembly import open_inbox, open_journal
 from rosbridge_eth.server.worker import LOOK_AT_LIST
 from smcrypto import InvalidKey, sm2, x509
 
-log = logging.getLogger(__name__)
-
-OWNER = "owner"
 GIVEN_UP = "given up by `revoke {}`"  # the reason of dead letters
+ACCOUNTS_TRIED = 1000
+OPERATOR = "operator"  # what `export` and the figures call the treasury's account
 GIVE_UP_AT_ONCE = 256  # records
 HANDING_OVER = 2 * LOOK_AT_LIST  # seconds after which no session of a name out of force is left
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
@@ -87,7 +88,7 @@ def init_home(
     write_atomically(home.ca / "ca.key.pem", ca.key.to_pem(passphrase), mode=0o600)
     write_atomically(home.ca / "ca.crt.pem", ca.certificate.to_pem())
     home.bundles.mkdir(mode=0o700)
-    registry = Registry(home.registry)
+    registry = Registry(home.registry, new=True)
     _enrol(home, registry, ca, Role.SERVER, server, home.server, passphrase, now)
     owner = _enrol(home, registry, ca, Role.READER, OWNER, home.reader(OWNER), passphrase, now)
     _publish_reader(home, owner)
@@ -215,14 +216,15 @@ def register_robot(
     later it would be a revoked identity's. clock, pause: the wall clock, to wait for that.
     """
     config, deployment = load_server_config(home.config), home.deployment()
-    contract = Contract.at(chain, deployment.contract)
+    check_name(name)
+    if name == OPERATOR:
+        raise IdentityError(f"{name!r} is what the treasury's account is called; choose another name for the robot")
     registry = Registry(home.registry)
     try:
-        check_name(name)
         if not replace:
             registry.require_free(Role.ROBOT, name)
-        number = registry.next_number()
-        account = keys.robot(number).address
+        contract = Contract.at(chain, deployment.contract)
+        number, account = _next_account(registry, contract, keys, name)
         if requests is None:
             identity = enrol(ca, Role.ROBOT, name, at=now)
             peer, files = identity.public, identity_files(identity, [ca.certificate], password)
@@ -235,6 +237,8 @@ def register_robot(
             }
         certificates = join_certificates(peer.signing_certificate.to_der(), peer.encryption_certificate.to_der())
         before = contract.robot(robot_id(name))
+        if before.registered and not replace:
+            raise IdentityError(_taken(name, before.may_write))
         if replace and before.may_write:
             if registry.find(Role.ROBOT, name) is not None:
                 registry.revoke(Role.ROBOT, name, now)
@@ -244,17 +248,12 @@ def register_robot(
                     " after its end: let the server run and register again, or give those records up with"
                     f" `revoke {name}` first"
                 )
-        known = before.registered
-        if known and not replace:
-            raise IdentityError(
-                f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
-            )
         given_up = 0
-        if known and not before.may_write:
+        if before.registered and not before.may_write:
             if registry.find(Role.ROBOT, name) is not None:
                 registry.revoke(Role.ROBOT, name, now)
             given_up = _give_up(home, config, registry, name, chain, clock, pause)
-        call = "replaceRegistration" if known else "registration"
+        call = "replaceRegistration" if before.registered else "registration"
         receipt = contract.transact(keys.operator, call, robot_id(name), account, certificates)
         allot(contract, keys, account, config)
         _register(registry, peer, account, now, replace=replace, number=number)
@@ -272,6 +271,30 @@ def register_robot(
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, seal_bundle(bundle, password), mode=0o600)
     return Registered(name, account, receipt.block_number, path, given_up)
+
+
+def _taken(name: str, may_write: bool) -> str:
+    """Why a name that the registry has not in force cannot be had without `replace`."""
+    if may_write:
+        return f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
+    return f"robot {name!r} was revoked; give --replace to enrol the name anew, with a new account and new keys"
+
+
+def _next_account(registry: Registry, contract: Contract, keys: Keyring, name: str) -> tuple[int, str]:
+    """The next number and its account. Those that the contract bound to other robots are left out.
+
+    A registry from an older backup does not know them. An account that the contract bound to this very name is one
+    that a registration which was cut short left.
+    """
+    first = registry.next_number()
+    for number in range(first, first + ACCOUNTS_TRIED):
+        account = keys.robot(number).address
+        if contract.robot_of(account) in (bytes(32), robot_id(name)):
+            return number, account
+    raise StoreError(
+        f"the contract knows the accounts {first} to {first + ACCOUNTS_TRIED - 1} of this home and the registry does"
+        " not: restore registry.sqlite from a newer backup"
+    )
 
 
 def _give_up(
@@ -314,8 +337,6 @@ def _give_up(
     finally:
         inbox.close()
         journal.close()
-    if buried:
-        log.warning("%d records that %s had handed over before it was revoked are dead letters now", buried, name)
     return buried
 
 
@@ -453,19 +474,40 @@ def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: by
     Robots know the server by its name and the CA, so nothing changes for them.
     A running server goes on with the old ones until it is started again.
     """
-    name = load_server_config(home.config).name
-    identity = enrol(ca, Role.SERVER, name, at=now)
-    made, old = home.path / "server.new", home.path / f"server.until-{now:%Y%m%dT%H%M%SZ}"
-    shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
-    save_identity(made, identity, [ca.certificate], passphrase)
-    home.server.rename(old)
-    made.rename(home.server)
     registry = Registry(home.registry)
     try:
+        identity = enrol(ca, Role.SERVER, load_server_config(home.config).name, at=now)
+        with _taking_the_place_of(home.server, now) as (made, old):
+            save_identity(made, identity, [ca.certificate], passphrase)
         _register(registry, identity.public, None, now, replace=True)
     finally:
         registry.close()
     return old
+
+
+@contextmanager
+def _taking_the_place_of(folder: Path, now: datetime) -> Iterator[tuple[Path, Path]]:
+    """A folder to fill, which takes the place of `folder` at the end, and where `folder` is kept aside then.
+
+    Neither's name is one that a reader may have. Cut short, nothing or an empty place is left, and it is done again.
+    """
+    made = folder.with_name(f".{folder.name}.new")
+    old = _free_name(folder.with_name(f"{folder.name}.until-{now:%Y%m%dT%H%M%SZ}"))
+    shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
+    try:
+        yield made, old
+        if folder.exists():
+            folder.rename(old)
+        made.rename(folder)
+    except BaseException:
+        shutil.rmtree(made, ignore_errors=True)
+        raise
+
+
+def _free_name(path: Path) -> Path:
+    """This name, or where it is taken the first of `-2`, `-3`, … that is not."""
+    others = (path.with_name(f"{path.name}-{n}") for n in count(2))
+    return next(name for name in one_after_another((path,), others) if not name.exists())
 
 
 def load_server_identity(home: OperatorHome, passphrase: bytes) -> Identity:

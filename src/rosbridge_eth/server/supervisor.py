@@ -133,11 +133,10 @@ class Supervisor:
 
     def _prepare(self) -> None:
         """The chain is the right one, the store is whole: only then may a robot be answered."""
-        chain = open_chain(self._config)
+        registry, chain = Registry(self._home.registry), open_chain(self._config)
         try:
             contract = bound_contract(chain, self._deployment)
             journal = open_journal(self._home, self._deployment)
-            registry = Registry(self._home.registry)
             try:
                 open_inbox(self._config, self._home).close()
                 robots = {robot_id(enrolment.name) for enrolment in registry.all(Role.ROBOT)}
@@ -146,9 +145,9 @@ class Supervisor:
                     log.warning("the journal lacks %d batches that the chain has; it is restored", sum(lost.values()))
                     adopt_history(journal, contract, lost, time.time())
             finally:
-                registry.close()
                 journal.close()
         finally:
+            registry.close()
             chain.close()
 
     def _start(self, name: str, task: Callable[[], None]) -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import sqlite3
 from pathlib import Path
 
 import pytest
 
-from bridge.server.world import TK, World
-from rosbridge_eth.errors import StoreError
+from bridge.server.world import NOW, TK, World
+from rosbridge_eth.errors import IdentityError, StoreError
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.identity import Role
 from rosbridge_eth.ledger import fetch
+from rosbridge_eth.records import robot_id
 
 
 @pytest.fixture
@@ -70,3 +72,40 @@ def test_without_a_server_a_robot_is_revoked_all_the_same_and_what_is_not_writte
     assert not world.revoke(world.wait).all_written
     assert not world.contract.robot(TK).may_write
     assert world.written() == {}
+
+
+def test_an_old_backup_of_the_registry_does_not_stop_registrations(world: World) -> None:
+    backup = world.home.registry.with_name("backup")
+    with sqlite3.connect(backup) as copy:
+        world.registry._db.backup(copy)
+    accounts = {world.register_as(f"robot_{n}").account for n in (1, 2, 3)}
+    with sqlite3.connect(backup) as copy:
+        copy.backup(world.registry._db)
+    new = world.register_as("robot_4")
+    assert new.account not in accounts
+    found = world.registry.find(Role.ROBOT, "robot_4")
+    assert found is not None and found.account == new.account == world.keys.robot(found.number).address
+    with pytest.raises(IdentityError, match="robot_2"):
+        world.register_as("robot_2")
+
+
+def test_a_revoked_name_is_said_to_be_one(world: World) -> None:
+    world.register()
+    world.revoke(world.wait)
+    with pytest.raises(IdentityError, match=r"was revoked; give --replace") as told:
+        world.register()
+    assert "registry does not" not in str(told.value)
+    world.register(replace=True)
+
+
+def test_a_name_that_only_the_contract_has_in_force_is_taken_over_only_on_demand(world: World) -> None:
+    world.register()
+    world.registry.revoke(Role.ROBOT, "robot_1", NOW)
+    with pytest.raises(IdentityError, match="the contract knows a robot 'robot_1' that the registry does not"):
+        world.register()
+
+
+def test_no_robot_is_called_as_the_treasury_is(world: World) -> None:
+    with pytest.raises(IdentityError, match="treasury"):
+        world.register_as("operator")
+    assert not world.contract.robot(robot_id("operator")).registered

@@ -60,8 +60,13 @@ class World:
         )
 
     def register(self, pause: Callable[[float], None] = lambda seconds: None, *, replace: bool = False) -> Registered:
+        return self.register_as("robot_1", pause, replace=replace)
+
+    def register_as(
+        self, name: str, pause: Callable[[float], None] = lambda seconds: None, *, replace: bool = False
+    ) -> Registered:
         return register_robot(
-            self.home, "robot_1", ca=load_ca(self.home, PASSPHRASE), keys=self.keys, chain=self.chain,
+            self.home, name, ca=load_ca(self.home, PASSPHRASE), keys=self.keys, chain=self.chain,
             password=b"robot's", now=NOW, replace=replace, clock=lambda: self.now, pause=pause,
         )
 
