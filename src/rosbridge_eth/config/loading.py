@@ -84,7 +84,7 @@ def _read(path: Path, example: str) -> str:
         size = path.stat().st_size
         if size > MAX_FILE:
             raise ConfigError(f"{path} has {size} bytes; a configuration has at most {MAX_FILE}")
-        return path.read_bytes().decode()
+        return path.read_bytes().decode("utf-8-sig")  # some editors begin every file with a byte order mark
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; create it, for instance with the line {example}") from None
     except IsADirectoryError:
@@ -137,7 +137,10 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str, values: Mapp
         hint = f"; did you mean {near[0]}?" if near else ""
         sentence = f"{key} is {_shown(given)}; allowed: {', '.join(allowed)}{hint}"
     elif kind in _EXPECTED:
-        sentence = f"{key} is {_shown(given)}; it should be {_EXPECTED[kind]}"
+        expected = _EXPECTED[kind]
+        if len(location) == 2 and location[0] == "topics":
+            expected = "a name in quotes, or a table"
+        sentence = f"{key} is {_shown(given)}; it should be {expected}"
     elif kind in _BOUNDS:
         name, words = _BOUNDS[kind]
         given, bound = _as_written(values, location, given, context[name])

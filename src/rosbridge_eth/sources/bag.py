@@ -34,6 +34,7 @@ from rosbridge_eth.sources.selection import Selection
 
 log = logging.getLogger(__name__)
 
+_BAGS = "a .bag, .mcap or .db3 file or the folder of a ROS 2 bag"
 MAX_WAIT_NS = 3600 * 10**9
 """A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
 
@@ -67,6 +68,14 @@ class BagSource:
         self._reader: Rosbag1Reader | Rosbag2Reader | None = None
         if not settings.path.exists():
             raise SourceError(f"{self._where} does not exist")
+        is_folder = settings.path.is_dir()
+        if is_folder and not (settings.path / "metadata.yaml").exists():
+            raise SourceError(
+                f"{self._where} is a folder without metadata.yaml, so no ROS 2 bag; name {_BAGS}, or let"
+                " `ros2 bag reindex` restore a metadata.yaml that was lost"
+            )
+        if not is_folder and settings.path.suffix not in (".bag", ".mcap", ".db3"):
+            raise SourceError(f"{self._where} is no bag by its name; name {_BAGS}")
         with self._translated():
             reader = Rosbag1Reader(settings.path) if self._wire is Wire.ROS1 else Rosbag2Reader(settings.path)
             reader.open()

@@ -244,6 +244,8 @@ class RedisInbox:
         for kind, says in _TROUBLES:
             if kind(error):
                 return f"the inbox in {self._place} cannot be used: {says}"
+        if isinstance(error, redis.ConnectionError):
+            text = f"{text.rstrip('.')}; start Redis, or correct [store] url"
         return f"the inbox in {self._place} cannot be used: {text}"
 
 

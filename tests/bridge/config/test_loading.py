@@ -114,7 +114,7 @@ MISTAKES = {
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
     "topics = []": "it names nothing to watch",
     'topics = "/a"': "line 1: topics is '/a'; it should be a list in [ ]",
-    "topics = [5]": "line 1: topics[0] is 5; it should be a table",
+    "topics = [5]": "line 1: topics[0] is 5; it should be a name in quotes, or a table",
     'topics = ["/a", "/a"]': "it names topic /a twice",
     'topics = ["/a b"]': "line 1: topics[0].topic: '/a b' is not a name or pattern",
     'nodes = ["/["]': "line 1: nodes[0]: '/[' is not a name or pattern",
@@ -297,3 +297,15 @@ def test_a_missing_file_is_named_by_what_it_is(tmp_path):
         require_file(tmp_path, "CA certificate")
     (tmp_path / "ca.pem").write_text("")
     assert require_file(tmp_path / "ca.pem", "CA certificate").name == "ca.pem"
+
+
+def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):
+    (tmp_path / "robot.toml").write_bytes(b"\xef\xbb\xbf" + b'topics = ["/a"]\n')
+    assert [topic.topic for topic in load_robot_config(tmp_path / "robot.toml").topics] == ["/a"]
+
+
+@pytest.mark.parametrize("given", ["1", '["/a"]', "true"])
+def test_a_topic_may_be_a_name_or_a_table(tmp_path, given):
+    (tmp_path / "robot.toml").write_text(f"topics = [{given}]\n")
+    with pytest.raises(ConfigError, match=r"line 1: topics\[0\] is .*; it should be a name in quotes, or a table$"):
+        load_robot_config(tmp_path / "robot.toml")

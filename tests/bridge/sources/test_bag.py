@@ -242,7 +242,6 @@ def test_what_is_not_a_bag_is_a_sentence(tmp_path):
         "text.db3": b"hello",
         "empty.mcap": b"",
         "text.mcap": b"\x89MCAP0\r\n" + b"x" * 100,
-        "bag.txt": b"x",
     }.items():
         file = tmp_path / name
         file.write_bytes(content)
@@ -251,8 +250,6 @@ def test_what_is_not_a_bag_is_a_sentence(tmp_path):
     with pytest.raises(SourceError, match="does not exist"):
         BagSource(BagSettings(tmp_path / "nowhere.bag"), Selection(["**"]))
     (tmp_path / "folder").mkdir()
-    with pytest.raises(SourceError, match="is damaged or not a bag"):
-        BagSource(BagSettings(tmp_path / "folder"), Selection(["**"]))
     (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2")
     with pytest.raises(SourceError, match="is damaged or not a bag"):
         BagSource(BagSettings(tmp_path / "folder"), Selection(["**"]))
@@ -335,3 +332,13 @@ def test_a_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
     records = [capture.process(message, 0, 0) for message in replayed(path, "/names")]
     assert [record and record.data["data"] for record in records] == ["hi", None, "ho"]
     assert len(notices) == 1
+
+
+@pytest.mark.parametrize("name, says", [
+    ("folder", "without metadata.yaml, so no ROS 2 bag"), ("notes.md", "by its name"),
+])
+def test_what_is_no_bag_is_told_with_what_a_bag_is(tmp_path, name, says):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "notes.md").write_text("no bag")
+    with pytest.raises(SourceError, match=f"{says}.*name a .bag, .mcap or .db3 file or the folder"):
+        BagSource(BagSettings(tmp_path / name), Selection(("/**",)))

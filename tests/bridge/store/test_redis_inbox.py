@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -404,3 +405,11 @@ def test_the_rights_that_the_documentation_names_are_enough_and_touch_no_other_k
             client.hget("another", "field")
         with pytest.raises(redis.exceptions.NoPermissionError):
             client.flushall()
+
+
+def test_a_redis_that_is_not_there_is_told_with_the_mend() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+        with pytest.raises(StoreError, match=r"127\.0\.0\.1:\d+ .*[^.]; start Redis, or correct \[store\] url$"):
+            RedisInbox(f"redis://127.0.0.1:{port}/0", "a binding")
