@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
 import subprocess
@@ -22,9 +23,11 @@ from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ExitCode, IdentityError
 from rosbridge_eth.home import OperatorHome, RobotHome
 from rosbridge_eth.identity import Role, load_identity
+from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot.assembly import join, open_robot
 from rosbridge_eth.robot.clock import certificate_clock
-from rosbridge_eth.server.administration import load_ca, renew_server
+from rosbridge_eth.server.administration import enrol_reader, load_ca, renew_server
 
 __all__ = ["made", "place"]  # fixtures
 
@@ -130,3 +133,68 @@ def test_the_server_is_renewed_twice_within_a_second(place: Path) -> None:
     assert load_identity(kept[0], b"operator's")[0].signing_certificate.to_der() == first.to_der()
     assert load_identity(home.server, b"operator's")[0].role is Role.SERVER
     assert not [path.name for path in home.path.iterdir() if "new" in path.name]
+
+
+def test_a_readers_name_is_made_anew_on_demand_and_the_old_keys_are_kept(place: Path, capsys: Capture) -> None:
+    ours = ("--passphrase-file", "pass", "--password-file", "word")
+    assert run(["reader", "analyst", *ours]) == 0
+    folder = OperatorHome(Path("operator")).reader("analyst")
+    old, _ = load_identity(folder, b"robot's")
+    fails(capsys, ExitCode.IDENTITY, "--replace", "reader", "analyst", *ours)
+    assert run(["revoke", "analyst", "--role", "reader", "--passphrase-file", "pass"]) in (0, ExitCode.CHAIN)
+    fails(capsys, ExitCode.IDENTITY, "--replace", "reader", "analyst", *ours)
+    for _ in range(2):  # a revoked one, and one in force
+        assert run(["reader", "analyst", "--replace", *ours]) == 0
+    new, _ = load_identity(folder, b"robot's")
+    assert {path.name for path in folder.iterdir()} >= {"public.pem", "reader.toml", "enc.key.pem"}
+    registry = Registry(Path("operator/registry.sqlite"))
+    assert registry.allows("reader", "analyst", new.signing_certificate.fingerprint())
+    assert not registry.allows("reader", "analyst", old.signing_certificate.fingerprint())
+    kept = sorted(path for path in folder.parent.iterdir() if path.name.startswith("analyst.until-"))
+    assert len(kept) == 2 and str(kept[0]) in capsys.readouterr().err
+    assert any(load_identity(path, b"robot's")[0].encryption_certificate == old.encryption_certificate for path in kept)
+
+
+def test_a_reader_that_is_not_made_leaves_the_old_one_where_it_is(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home, now = OperatorHome(Path("operator")), datetime.now(UTC)
+    ca = load_ca(home, b"operator's")
+    before = sorted(home.path.rglob("*"))
+    monkeypatch.setattr("rosbridge_eth.server.administration.write_reader_toml", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        enrol_reader(home, "owner", ca=ca, password=b"word", now=now, replace=True)
+    assert [path for path in sorted(home.path.rglob("*")) if "registry" not in path.name] == [
+        path for path in before if "registry" not in path.name
+    ]
+    registry = Registry(home.registry)
+    assert registry.find("reader", "owner") == registry.all("reader")[0]
+
+
+def test_export_never_takes_the_treasury_for_a_robot(place: Path, capsys: Capture) -> None:
+    ours = ("--passphrase-file", "pass", "--password-file", "word")
+    registry = Registry(Path("operator/registry.sqlite"))
+    registry.enrol(number=registry.next_number(), role="robot", name="operator", fingerprint=b"f" * 32,
+                   certificates=b"", account="0x1", now=datetime.now(UTC))  # before the name was reserved
+    fails(capsys, ExitCode.IDENTITY, "--role", "export", "operator", "a.json", *ours)
+    assert not Path("a.json").exists()
+    assert run(["export", "operator", "a.json", "--role", "operator", *ours]) == 0
+    assert run(["export", "operator", "b.json", "--role", "robot", *ours]) == 0
+    registry.revoke("robot", "operator", datetime.now(UTC))
+    assert run(["export", "operator", "c.json", *ours]) == 0
+    keys = Keyring.load(Path("operator/accounts.json"), b"operator's")
+    addresses = [json.loads(Path(file).read_text())["address"][-40:].lower() for file in ("a.json", "b.json", "c.json")]
+    treasury = keys.operator.address.lower().removeprefix("0x")
+    assert [address == treasury for address in addresses] == [True, False, True]
+    fails(capsys, ExitCode.IDENTITY, "reader 'owner'", "export", "owner", "d.json", "--role", "reader", *ours)
+
+
+def test_a_record_is_asked_for_by_a_name_that_is_enrolled_and_a_stream_that_is_one(
+    place: Path, capsys: Capture
+) -> None:
+    stream = "0f" * 16
+    fails(capsys, ExitCode.IDENTITY, "no robot 'robot_9' is enrolled; `status` lists", "check", "robot_9", stream, "1")
+    for wrong in ("zz", "0f" * 15, "0f" * 17, "0f " * 16):
+        fails(capsys, ExitCode.CONFIG, "the stream is 32 hex digits", "check", "robot_1", wrong, "1")
+    assert run(["check", "robot_1", stream, "1"]) == 0
+    assert capsys.readouterr().out.strip() == "unknown"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+import re
 import signal
 import time
 from datetime import UTC, datetime
@@ -159,6 +160,9 @@ def _requests(signing: Path, encryption: Path) -> Any:
 def add_reader(
     name: Annotated[str, typer.Argument(help="The reader's name.")],
     home: OperatorHomeOption = OPERATOR_HOME,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Take a used name over; revokes the old one and keeps its folder aside.")
+    ] = False,
     passphrase_file: PassphraseFile = None,
     password_file: Annotated[
         Path | None, typer.Option(help="Read the new reader's passphrase from the first line of this file.")
@@ -170,7 +174,11 @@ def add_reader(
     place = OperatorHome(home).require()
     ca = load_ca(place, _passphrase(passphrase_file))
     password = read_passphrase("reader", f"Passphrase of reader {name}", file=password_file, confirm=True)
-    folder = enrol_reader(place, name, ca=ca, password=password, now=_now())
+    made = enrol_reader(place, name, ca=ca, password=password, now=_now(), replace=replace)
+    folder = made.folder
+    if made.old is not None:
+        talk(f"The old {name} is in {made.old}: only its keys open what was sealed for it. Robots seal on for it, too,")
+        talk("until its file in their readers folder gives way to the new public.pem.")
     talk(f"{folder} is the home of reader {name}; it can be carried elsewhere. Its reader.toml names the node to ask.")
     talk(f"A robot registered before seals for it too once {folder / 'public.pem'} is in the robot's readers folder.")
 
@@ -183,6 +191,7 @@ def revoke(
 ) -> None:
     """Revoke a name: the server closes its session at once, and the chain takes nothing from it any more."""
     from rosbridge_eth.ledger.accounts import Keyring
+    from rosbridge_eth.server.administration import COUNTED
     from rosbridge_eth.server.administration import revoke as revoke_name
     from rosbridge_eth.server.assembly import open_chain
 
@@ -194,8 +203,13 @@ def revoke(
     finally:
         node.close()
     talk(f"{role} {name} is revoked" + (f", on the chain in block {ended.block}." if ended.block is not None else "."))
-    if not ended.all_written:
-        talk("The server has records of it that were not on the chain in time; they stay in its journal, see `status`.")
+    if ended.not_written:
+        number = f"{ended.not_written} records" if ended.not_written < COUNTED else f"{COUNTED} records or more"
+        talk(
+            f"{number} that {name} had handed over were not on the chain in time and will never be: they stay in the"
+            " server's store, where `status` counts them as inbox waiting or batches sealed, until `register"
+            f" {name} --replace` makes dead letters of them."
+        )
 
 
 def renew(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
@@ -212,6 +226,7 @@ def export(
     name: Annotated[str, typer.Argument(help="A robot's name, or `operator`.")],
     file: Annotated[Path, typer.Argument(help="The keystore to write.")],
     home: OperatorHomeOption = OPERATOR_HOME,
+    role: Annotated[Role | None, typer.Option(help="Whose account: robot or operator.")] = None,
     passphrase_file: PassphraseFile = None,
     password_file: Annotated[
         Path | None, typer.Option(help="Read the keystore's own password from the first line of this file.")
@@ -221,17 +236,22 @@ def export(
     from rosbridge_eth.home import write_atomically
     from rosbridge_eth.ledger.accounts import Keyring
     from rosbridge_eth.registry import Registry
+    from rosbridge_eth.server.administration import OPERATOR
 
     place = OperatorHome(home).require()
     if file.exists():
         raise ConfigError(f"{file} exists; choose another name")
     keys = Keyring.load(place.accounts, _passphrase(passphrase_file))
+    registry = Registry(place.registry)
+    robot = registry.find(Role.ROBOT, name)
+    registry.close()
+    if robot is not None and name == OPERATOR and role is None:
+        raise IdentityError(f"{name!r} is a robot and what the treasury is called; say --role robot or --role operator")
     number = 0
-    if name != "operator":
-        found = Registry(place.registry).find(Role.ROBOT, name)
-        if found is None:
-            raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
-        number = found.number
+    if role is Role.ROBOT or name != OPERATOR:
+        if robot is None or role not in (Role.ROBOT, None):
+            raise IdentityError(f"no {role or Role.ROBOT} {name!r} has an account; `status` lists the names")
+        number = robot.number
     password = read_passphrase("keystore", "Password of the keystore", file=password_file, confirm=True)
     write_atomically(file, jsonlib.dumps(keys.export(number, password)).encode() + b"\n", mode=0o600)
     talk(f"{file} holds the account {keys.account(number).address}.")
@@ -273,14 +293,22 @@ def check(
     """Where is this record? Asks the store, and where it is in a block, the contract itself (checkData)."""
     from rosbridge_eth.ledger import Contract, merkle
     from rosbridge_eth.records import RecordId, robot_id
+    from rosbridge_eth.registry import Registry
     from rosbridge_eth.server.assembly import open_chain, open_inbox, open_journal
     from rosbridge_eth.server.whereabouts import whereabouts
 
     place = OperatorHome(home).require()
+    if not re.fullmatch(r"[0-9a-fA-F]{32}", stream):
+        raise ConfigError(f"the stream is 32 hex digits, as `read` shows it, not {stream!r}")
     try:
         id = RecordId(robot_id(robot), bytes.fromhex(stream), seq)
     except ValueError as error:
         raise ConfigError(f"not a record's identity: {error}") from error
+    registry = Registry(place.registry)
+    names = {enrolment.name for enrolment in registry.all(Role.ROBOT)}  # a revoked one's records are there still
+    registry.close()
+    if robot not in names:
+        raise IdentityError(f"no robot {robot!r} is enrolled; `status` lists the names")
     config, deployment = load_server_config(place.config), place.deployment()
     journal, inbox = open_journal(place, deployment), open_inbox(config, place)
     found = whereabouts(id, inbox, journal, time.time())

@@ -40,6 +40,7 @@ from rosbridge_eth.identity import (
 from rosbridge_eth.ledger import Chain, Contract, deploy
 from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.ledger.journal import Attempt, Binding
+from rosbridge_eth.ledger.states import State
 from rosbridge_eth.reading import join_certificates
 from rosbridge_eth.records import robot_id
 from rosbridge_eth.registry import OWNER, Enrolment, Registry
@@ -50,6 +51,7 @@ from smcrypto import InvalidKey, sm2, x509
 GIVEN_UP = "given up by `revoke {}`"  # the reason of dead letters
 ACCOUNTS_TRIED = 1000
 OPERATOR = "operator"  # what `export` and the figures call the treasury's account
+COUNTED = 1000  # records
 GIVE_UP_AT_ONCE = 256  # records
 HANDING_OVER = 2 * LOOK_AT_LIST  # seconds after which no session of a name out of force is left
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
@@ -91,7 +93,7 @@ def init_home(
     registry = Registry(home.registry, new=True)
     _enrol(home, registry, ca, Role.SERVER, server, home.server, passphrase, now)
     owner = _enrol(home, registry, ca, Role.READER, OWNER, home.reader(OWNER), passphrase, now)
-    _publish_reader(home, owner)
+    _publish_reader(home.reader(OWNER), owner)
     registry.close()
     Keyring.create().save(home.accounts, passphrase)
     write_atomically(home.config, server_toml(listen, public, chain_url, server).encode())
@@ -167,7 +169,7 @@ def deploy_contract(home: OperatorHome, chain: Chain, operator: Keyring) -> Depl
     finally:
         registry.close()
     for name in names:
-        write_reader_toml(home, name)
+        write_reader_toml(home, home.reader(name))
     return deployment
 
 
@@ -242,11 +244,11 @@ def register_robot(
         if replace and before.may_write:
             if registry.find(Role.ROBOT, name) is not None:
                 registry.revoke(Role.ROBOT, name, now)
-            if not _handed_over_is_written(home, config, name, SUCCESSION, clock, pause):
+            if left := _not_written(home, config, name, SUCCESSION, clock, pause):
                 raise StoreError(
-                    f"what the old {name!r} handed to the server is not on the chain yet, and would count as written"
-                    " after its end: let the server run and register again, or give those records up with"
-                    f" `revoke {name}` first"
+                    f"{left} records that the old {name!r} handed to the server are not on the chain yet, and would"
+                    " count as written after its end: let the server run and register again, or give those records up"
+                    f" with `revoke {name}` first"
                 )
         given_up = 0
         if before.registered and not before.may_write:
@@ -346,29 +348,35 @@ def _written(chain: Chain, attempts: Sequence[Attempt]) -> bool:
     return any(receipt is not None and receipt.succeeded for receipt in receipts)
 
 
-def _handed_over_is_written(
+def _not_written(
     home: OperatorHome,
     config: ServerConfig,
     name: str,
     patience: float,
     clock: Callable[[], float],
     pause: Callable[[float], None],
-) -> bool:
-    """Wait until everything that a robot out of force handed to the server is confirmed; False if it takes too long."""
+) -> int:
+    """Wait until all that a robot out of force handed to the server is confirmed; how many records are not by then.
+
+    Of those in the inbox at most COUNTED are counted.
+    """
     inbox, journal = open_inbox(config, home), open_journal(home, home.deployment())
-    last = clock() + HANDING_OVER
+    robot, last = robot_id(name), clock() + HANDING_OVER
+
+    def left(limit: int) -> int:
+        ids = [record.id for record in inbox.held(robot, limit)]  # before the journal: that is how records go
+        sealed = sum(job.count for job in journal.jobs() if job.robot == robot and job.state is not State.SPLIT)
+        return sealed + len(set(ids) - journal.known(ids))
+
     try:
         while (now := clock()) < last + patience:
-            oldest = inbox.statistics(now).oldest_age
-            if now >= last and (oldest is None or now - oldest > last):  # the inbox is taken from in order of arrival
-                waiting = sum(job.count for job in journal.jobs() if job.robot == robot_id(name))
-                if waiting == 0:
-                    return True
+            if now >= last and left(1) == 0:
+                return 0
             pause(0.2)
+        return left(COUNTED)
     finally:
         inbox.close()
         journal.close()
-    return False
 
 
 def allot(contract: Contract, keys: Keyring, account: str, config: ServerConfig) -> None:
@@ -382,35 +390,58 @@ def readers(registry: Registry) -> Sequence[Enrolment]:
     return [reader for reader in registry.all(Role.READER) if reader.revoked_at is None]
 
 
+@dataclass(frozen=True, slots=True)
+class EnrolledReader:
+    """A reader's home, and where the one that bore its name before is kept, if there was one."""
+
+    folder: Path
+    old: Path | None
+
+
 def enrol_reader(
-    home: OperatorHome, name: str, *, ca: CertificateAuthority, password: bytes, now: datetime
-) -> Path:
-    """Make another reader's home; robots that are registered from now on seal for it too."""
+    home: OperatorHome, name: str, *, ca: CertificateAuthority, password: bytes, now: datetime, replace: bool = False
+) -> EnrolledReader:
+    """Make another reader's home; robots that are registered from now on seal for it too.
+
+    replace: take a used name over. What was sealed for the old one only it can read, so its folder is kept aside.
+    """
+    check_name(name)
+    folder = home.reader(name)
     registry = Registry(home.registry)
     try:
-        registry.require_free(Role.READER, check_name(name))
-        identity = _enrol(home, registry, ca, Role.READER, name, home.reader(name), password, now)
+        if not replace:
+            registry.require_free(Role.READER, name)
+            if folder.exists():
+                raise IdentityError(
+                    f"{folder} is a revoked reader's; choose another name, or give --replace to make {name!r} anew and"
+                    " keep that folder aside"
+                )
+        had = folder.exists()
+        identity = enrol(ca, Role.READER, name, at=now)
+        with _taking_the_place_of(folder, now) as (made, old):
+            save_identity(made, identity, [ca.certificate], password)
+            _publish_reader(made, identity)
+            if home.deployment_file.exists():
+                write_reader_toml(home, made)
+        _register(registry, identity.public, None, now, replace=replace)
     finally:
         registry.close()
-    _publish_reader(home, identity)
-    if home.deployment_file.exists():
-        write_reader_toml(home, name)
-    return home.reader(name)
+    return EnrolledReader(folder, old if had else None)
 
 
-def _publish_reader(home: OperatorHome, reader: Identity) -> None:
+def _publish_reader(folder: Path, reader: Identity) -> None:
     """The certificates by which robots seal for this reader, in one file."""
     certificates = reader.signing_certificate.to_pem() + reader.encryption_certificate.to_pem()
-    write_atomically(ReaderHome(home.reader(reader.name)).public, certificates)
+    write_atomically(ReaderHome(folder).public, certificates)
 
 
-def write_reader_toml(home: OperatorHome, name: str) -> None:
+def write_reader_toml(home: OperatorHome, folder: Path) -> None:
     """Make the folder of a reader one that can be carried elsewhere; needs the contract."""
     deployment, node = home.deployment(), urlsplit(load_server_config(home.config).chain.url)
     # Of the operator's node only scheme, host and port: what else stands in a URL is often a key.
     host = f"{node.scheme}://{node.netloc.rpartition('@')[2]}" if node.scheme else "http://127.0.0.1:8545"
     write_atomically(
-        ReaderHome(home.reader(name)).config,
+        ReaderHome(folder).config,
         (
             "# A reader: rosbridge-eth read ROBOT --config reader.toml. docs/configuration.md describes every key.\n"
             f'contract = "{deployment.contract}"\n'
@@ -425,11 +456,11 @@ def write_reader_toml(home: OperatorHome, name: str) -> None:
 class Revoked:
     """block: where the contract ended a robot's right to write; None for others, and where it had none.
 
-    all_written: False if the server had records of it that are not on the chain and now never will be.
+    not_written: records of it that the server has, that are not on the chain, and that now never will be.
     """
 
     block: int | None
-    all_written: bool = True
+    not_written: int = 0
 
 
 def revoke(
@@ -464,8 +495,8 @@ def revoke(
         if in_force is None:
             raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
         return Revoked(None)
-    all_written = _handed_over_is_written(home, load_server_config(home.config), name, LAST_WRITES, clock, pause)
-    return Revoked(contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number, all_written)
+    not_written = _not_written(home, load_server_config(home.config), name, LAST_WRITES, clock, pause)
+    return Revoked(contract.transact(keys.operator, "revokeRobot", robot_id(name)).block_number, not_written)
 
 
 def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime) -> Path:

@@ -54,7 +54,7 @@ def sealed(world: World) -> None:
 def test_what_waits_in_the_inbox_becomes_dead_letters_with_the_reason(world: World, journal: Journal) -> None:
     world.register()
     world.hand_over(0, 300)  # more than are given up at once
-    assert not world.revoke(world.wait).all_written
+    assert world.revoke(world.wait).not_written == 300
     assert world.register(world.wait, replace=True).given_up == 300
     assert dead(journal) == dict.fromkeys(range(300), REASON)
     assert world.inbox.statistics(world.now).waiting == 0

@@ -49,7 +49,7 @@ def test_without_a_server_the_robot_is_not_replaced_and_the_way_out_is_told(worl
 
 def test_a_robot_revoked_on_the_chain_is_replaced_without_waiting(world: World) -> None:
     old = world.register()
-    assert world.revoke(world.wait).all_written
+    assert world.revoke(world.wait).not_written == 0
 
     def never(seconds: float) -> None:
         pytest.fail("there is nothing to wait for")
@@ -61,7 +61,7 @@ def test_what_a_revoked_robot_handed_over_is_written_before_its_right_ends(world
     account = world.register().account
     world.hand_over(0, 5)
     ended = world.revoke(world.serve)
-    assert ended.all_written and ended.block is not None
+    assert ended.not_written == 0 and ended.block is not None
     assert world.written() == dict.fromkeys(range(5), account)
     assert not world.contract.robot(TK).may_write
 
@@ -69,7 +69,7 @@ def test_what_a_revoked_robot_handed_over_is_written_before_its_right_ends(world
 def test_without_a_server_a_robot_is_revoked_all_the_same_and_what_is_not_written_is_told(world: World) -> None:
     world.register()
     world.hand_over(0, 5)
-    assert not world.revoke(world.wait).all_written
+    assert world.revoke(world.wait).not_written == 5
     assert not world.contract.robot(TK).may_write
     assert world.written() == {}
 
