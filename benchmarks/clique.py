@@ -1,0 +1,205 @@
+"""A private network as the paper had it: geth nodes that sign blocks in turn by proof of authority (Clique, EIP-225).
+
+Each node is its own process with its own keys, database and peers, on
+loopback. geth 1.13 is the last one that signs Clique blocks;
+`benchmarks/install_geth.sh` builds it. Used by the tests of the ledger on a
+real node and by chain_interaction.py.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from eth_account import Account
+from eth_keys.datatypes import PrivateKey
+
+from rosbridge_eth.ledger.failures import NodeFailure
+from rosbridge_eth.ledger.jsonrpc import JsonRpcChain
+
+CHAIN_ID, EPOCH, GAS_LIMIT = 4711, 30_000, 30_000_000
+PATIENCE = 60.0
+_PASSWORD = "a node's own, on a machine that nobody else uses"
+
+
+class Unavailable(Exception):
+    """There is no geth that can sign Clique blocks."""
+
+
+def find_geth() -> str:
+    """The program named by GETH, or on PATH."""
+    program = os.environ.get("GETH") or shutil.which("geth")
+    if not program or not Path(program).exists():
+        raise Unavailable("no geth 1.13 is installed: benchmarks/install_geth.sh builds it, GETH names it")
+    said = subprocess.run([program, "version"], capture_output=True, text=True, check=True).stdout
+    if "Version: 1.13." not in said:
+        raise Unavailable(f"{program} is not geth 1.13, later ones cannot sign Clique blocks")
+    return program
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports below those that the kernel gives out by itself."""
+    found: list[int] = []
+    while len(found) < count:
+        port = random.SystemRandom().randrange(20_000, 32_000)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        if port not in found:
+            found.append(port)
+    return found
+
+
+def genesis(signers: list[str], balances: Mapping[str, int], period: int) -> dict[str, Any]:
+    """The first block of a network with London's rules, where these may sign, one block every `period` seconds."""
+    forks = ["homestead", "eip150", "eip155", "eip158", "byzantium", "constantinople", "petersburg", "istanbul",
+             "berlin", "london"]
+    between = "".join(address[2:].lower() for address in sorted(signers, key=str.lower))
+    return {
+        "config": {"chainId": CHAIN_ID, **{f"{fork}Block": 0 for fork in forks},
+                   "clique": {"period": period, "epoch": EPOCH}},
+        "difficulty": "1",
+        "gasLimit": hex(GAS_LIMIT),
+        "extraData": "0x" + "00" * 32 + between + "00" * 65,
+        "alloc": {address: {"balance": hex(wei)} for address, wei in balances.items()},
+    }
+
+
+class Node:
+    """One geth: a signer with its keys unlocked, as nobody may run it who has anything to lose."""
+
+    def __init__(self, program: str, folder: Path, signer: PrivateKey) -> None:
+        self._program, self._folder, self._signer = program, folder, signer
+        self.signer = signer.public_key.to_checksum_address()
+        self.http_port, self.ws_port, self._peer_port, self._engine_port = free_ports(4)
+        self.url, self.ws_url = f"http://127.0.0.1:{self.http_port}", f"ws://127.0.0.1:{self.ws_port}"
+        # The node's name in the network is a public key too; the signer's serves.
+        self.enode = f"enode://{signer.public_key.to_hex()[2:]}@127.0.0.1:{self._peer_port}?discport=0"
+        self._process: subprocess.Popen[bytes] | None = None
+        (folder / "keystore").mkdir(parents=True)
+        locked = Account.encrypt(signer.to_bytes(), _PASSWORD, kdf="pbkdf2", iterations=1)
+        (folder / "keystore" / f"UTC--2026-01-01T00-00-00Z--{self.signer[2:].lower()}").write_text(json.dumps(locked))
+        (folder / "password").write_text(_PASSWORD)
+        (folder / "nodekey").write_text(signer.to_hex()[2:])
+
+    @property
+    def log(self) -> Path:
+        return self._folder / "geth.log"
+
+    def init(self, first_block: dict[str, Any]) -> None:
+        file = self._folder / "genesis.json"
+        file.write_text(json.dumps(first_block))
+        subprocess.run([self._program, "init", "--datadir", str(self._folder), str(file)], capture_output=True,
+                       check=True)
+
+    def start(self) -> None:
+        options = {
+            "datadir": self._folder, "nodekey": self._folder / "nodekey", "networkid": CHAIN_ID, "syncmode": "full",
+            "port": self._peer_port, "nat": "none", "netrestrict": "127.0.0.0/8", "authrpc.port": self._engine_port,
+            "http.port": self.http_port, "http.api": "eth,net,web3,admin,miner", "ws.port": self.ws_port,
+            "ws.api": "eth,net,web3", "unlock": self.signer, "password": self._folder / "password",
+            "miner.etherbase": self.signer, "miner.gasprice": 1, "cache": 64, "verbosity": 3,
+        }
+        flags = ["nodiscover", "ipcdisable", "http", "ws", "allow-insecure-unlock", "mine"]
+        with self.log.open("ab") as log:
+            self._process = subprocess.Popen(
+                [self._program, *(f"--{flag}" for flag in flags), *(f"--{k}={v}" for k, v in options.items())],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                self.request("eth_chainId")
+                return
+            except NodeFailure as failure:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    raise RuntimeError(self.log.read_text(errors="replace")[-2000:]) from failure
+                time.sleep(0.05)
+
+    def request(self, method: str, *params: object) -> Any:
+        chain = JsonRpcChain(self.url, timeout=5)
+        try:
+            return chain.request(method, *params)
+        finally:
+            chain.close()
+
+    def height(self) -> int:
+        return int(self.request("eth_blockNumber"), 16)
+
+    def kill(self) -> None:
+        """As a power cut would; what it had not written to its disk is gone."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+
+class Network:
+    """`signers` nodes that know each other. With three of them, two make blocks without the third (EIP-225)."""
+
+    def __init__(self, folder: Path, balances: Mapping[str, int], *, signers: int = 3, period: int = 1) -> None:
+        program = find_geth()
+        keys = [PrivateKey(os.urandom(32)) for _ in range(signers)]
+        self.nodes = [Node(program, folder / f"node-{number}", key) for number, key in enumerate(keys)]
+        first_block = genesis([node.signer for node in self.nodes], balances, period)
+        try:
+            for node in self.nodes:
+                node.init(first_block)
+                node.start()
+            self.connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Network:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        for node in self.nodes:
+            node.kill()
+
+    def connect(self) -> None:
+        """Everybody to everybody; returns when all are."""
+        for node in self.nodes:
+            for other in self.nodes:
+                if other is not node:
+                    node.request("admin_addPeer", other.enode)
+        self._await("the nodes are connected",
+                    lambda: all(int(node.request("net_peerCount"), 16) == len(self.nodes) - 1 for node in self.nodes))
+
+    def cut_off(self, node: Node) -> None:
+        """`node` hears the others no more, nor they it, until `connect`."""
+        others = [other for other in self.nodes if other is not node]
+
+        def alone() -> bool:
+            for other in others:  # again and again: a connection that was just being made outlives the order to drop it
+                other.request("admin_removePeer", node.enode)
+                node.request("admin_removePeer", other.enode)
+            return int(node.request("net_peerCount"), 16) == 0
+
+        self._await("the node is alone", alone)
+
+    def await_blocks(self, count: int, node: Node | None = None) -> None:
+        """Until so many more blocks are on top."""
+        node = node or self.nodes[0]
+        aim = node.height() + count
+        self._await(f"{count} more blocks", lambda: node.height() >= aim)
+
+    def _await(self, what: str, holds: Any) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not holds():
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"{what}: not within {PATIENCE:.0f} s")
+            time.sleep(0.05)
