@@ -204,6 +204,11 @@ class Server:
         """Who has a session here."""
         return [c.peer for c in self._connections.values() if c.state is ServerState.CONNECTED]
 
+    def address_of(self, connection: bytes) -> Address | None:
+        """Where the client of a connection was proven to be last; None if the connection is gone."""
+        found = self._connections.get(connection)
+        return None if found is None else found.address
+
     def statistics(self) -> Statistics:
         return self._counters.snapshot(
             connections=len(self._by_peer), half_open=len(self._half_open), held_bytes=self._budget.used
