@@ -96,11 +96,10 @@ def examine(checks: Iterable[tuple[str, Check]]) -> Iterator[Finding]:
         try:
             yield from check()
         except BridgeError as error:
-            text = str(error)
-            found, _, mend = text.partition("; ")
-            if not mend:  # two sentences, the second of which says what to do
-                found, _, mend = text.partition(". ")
-            yield broken(what, found, mend or "correct what this names")
+            # What to do comes after what is wrong: as its last part, after a reason in brackets, or in a second sentence.
+            parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
+            found, mark, mend = next((part for part in parts if part[2]), (str(error), "", ""))
+            yield broken(what, found + mark.strip(".;: "), mend or "correct what this names")
 
 
 def checks_of(path: Path, kind: HomeKind, passphrase: bytes | None) -> list[tuple[str, Check]]:
