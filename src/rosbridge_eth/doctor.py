@@ -96,7 +96,7 @@ def examine(checks: Iterable[tuple[str, Check]]) -> Iterator[Finding]:
         try:
             yield from check()
         except BridgeError as error:
-            # What to do comes after what is wrong: as its last part, after a reason in brackets, or in a second sentence.
+            # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
             parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
             found, mark, mend = next((part for part in parts if part[2]), (str(error), "", ""))
             yield broken(what, found + mark.strip(".;: "), mend or "correct what this names")
