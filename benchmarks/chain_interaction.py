@@ -1,0 +1,204 @@
+"""The paper's chain interaction, on a real network: each client registers once, writes four times, asks four times.
+
+    python benchmarks/chain_interaction.py [--clients N] [--period SECONDS] [--chain clique|anvil] [--json FILE]
+
+The chain is three geth nodes that sign by proof of authority (clique.py), or
+anvil. Eight processes make the requests, as in the paper. The operator
+registers and funds the clients; each client then writes records of 256 bytes
+with `setData` from its own account, and asks for each with `checkData`.
+
+A write is timed in three parts, which the paper's figure does not tell apart:
+until the node accepts the transaction, until a block that this node knows
+holds it, and until that block has two more on top. A query is one eth_call.
+What counts as success of a write is that it is confirmed, of a query that the
+contract answers `true`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import clique
+
+from rosbridge_eth import ledger
+from rosbridge_eth.ledger import anvil
+from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.ledger.chain import Call
+from rosbridge_eth.ledger.contract import Contract, calldata
+from rosbridge_eth.ledger.failures import NodeFailure
+from rosbridge_eth.ledger.transactions import Fees, Transaction, sign
+from rosbridge_eth.records import RecordId, SealedRecord, robot_id
+
+PROCESSES, WRITES, QUERIES, CONFIRMATIONS = 8, 4, 4, 3
+ETH = 10**18
+PATIENCE = 120.0
+Times = dict[str, list[float]]
+KEYS = Keyring.from_mnemonic("test test test test test test test test test test test junk")  # of every test chain
+
+
+@contextmanager
+def network(kind: str, clients: int, period: int) -> Iterator[list[str]]:
+    """The URLs of its nodes."""
+    with tempfile.TemporaryDirectory(prefix="interaction-") as folder:
+        if kind == "clique":
+            with clique.Network(Path(folder), {KEYS.operator.address: 10_000 * ETH}, period=period) as running:
+                running.await_blocks(3)
+                yield [node.url for node in running.nodes]
+        else:
+            with anvil.start(clique.free_ports(1)[0], block_time=period) as node:
+                chain = ledger.connect(node.url)
+                chain.request("anvil_setBalance", KEYS.operator.address, hex(10_000 * ETH))
+                for client in range(1, clients + 1):  # some of them are those that anvil makes rich
+                    chain.request("anvil_setBalance", KEYS.robot(client).address, "0x0")
+                chain.close()
+                yield [node.url]
+
+
+class Requests:
+    """Transactions of some accounts, followed until they are confirmed."""
+
+    def __init__(self, contract: Contract, times: Times) -> None:
+        self._contract, self._chain, self._times = contract, contract.chain, times
+        self._sent: dict[bytes, float] = {}
+        self._id, self._fees = self._chain.chain_id(), Fees.suggested(self._chain.head(), self._chain.priority_fee())
+
+    def send(self, account: object, nonce: int, data: bytes, value: int = 0) -> None:
+        gas = self._chain.estimate_gas(Call(self._contract.address, data, account.address, value)) * 5 // 4
+        signed = sign(Transaction(self._id, nonce, self._contract.address, data, gas, self._fees, value), account)
+        before = time.perf_counter()
+        [answer] = self._chain.send([signed.raw])
+        if isinstance(answer, NodeFailure):
+            self._times["refused"].append(0.0)
+            return
+        self._sent[signed.hash] = time.perf_counter()
+        self._times["submit"].append(self._sent[signed.hash] - before)
+
+    def settle(self) -> None:
+        """Until all are confirmed, or it took too long."""
+        waiting, included = dict(self._sent), {}
+        self._sent.clear()
+        deadline = time.monotonic() + PATIENCE
+        while (waiting or included) and time.monotonic() < deadline:
+            for hash, receipt in zip(list(waiting), self._chain.receipts(list(waiting)), strict=True):
+                if receipt is not None:
+                    now = time.perf_counter()
+                    self._times["include"].append(now - waiting.pop(hash))
+                    included[hash] = receipt, now
+            head = self._chain.head().number
+            for hash, (receipt, since) in list(included.items()):
+                if head >= receipt.block_number + CONFIRMATIONS - 1:
+                    [now_in] = self._chain.receipts([hash])
+                    self._times["confirm"].append(time.perf_counter() - since)
+                    self._times["written" if now_in and now_in.succeeded else "failed"].append(0.0)
+                    del included[hash]
+            time.sleep(0.05)
+        self._times["late"] += [0.0] * (len(waiting) + len(included))
+
+
+def record(client: int, number: int) -> SealedRecord:
+    id = RecordId(robot_id(f"client_{client}"), bytes(16), number)
+    return SealedRecord(id, (f"{client}/{number} ".encode() * 64)[:256])
+
+
+def write_and_ask(url: str, address: str, clients: list[int]) -> Times:
+    """One of the eight processes."""
+    times: Times = defaultdict(list)
+    chain = ledger.connect(url)
+    contract = Contract.at(chain, address)
+    requests = Requests(contract, times)
+    for number in range(WRITES):
+        for client in clients:
+            sealed = record(client, number)
+            data = calldata("setData", sealed.id.robot, number, sealed.id.stream, number, sealed.ciphertext)
+            requests.send(KEYS.robot(client), number, data)
+        requests.settle()
+    for number in range(QUERIES):
+        for client in clients:
+            before = time.perf_counter()
+            found = contract.check_data(record(client, number), number, 0, 1, ())
+            times["query"].append(time.perf_counter() - before)
+            times["answered" if found else "denied"].append(0.0)
+    chain.close()
+    return dict(times)
+
+
+def measure(kind: str, clients: int, period: int) -> dict[str, Times]:
+    """{"registration": ..., "use": ...}."""
+    with network(kind, clients, period) as urls:
+        chain = ledger.connect(urls[0])
+        contract = ledger.deploy(chain, KEYS.operator)
+        times: Times = defaultdict(list)
+        requests, nonce = Requests(contract, times), chain.nonce(KEYS.operator.address)
+        # Each registration first: money goes to registered accounts alone, and not above 5 ETH.
+        for function, value in (("registration", 0), ("allocETH", ETH // 10)):
+            for client in range(1, clients + 1):
+                address = KEYS.robot(client).address
+                data = (calldata(function, robot_id(f"client_{client}"), address, b"certificates")
+                        if function == "registration" else calldata(function, address))
+                requests.send(KEYS.operator, nonce, data, value)
+                nonce += 1
+            requests.settle()
+            if function == "registration":
+                registered = {name: list(values) for name, values in times.items()}
+        shares = [list(range(1 + process, clients + 1, PROCESSES)) for process in range(PROCESSES)]
+        with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
+            parts = pool.starmap(write_and_ask, [
+                (urls[number % len(urls)], contract.address, share) for number, share in enumerate(shares) if share
+            ])
+        use: Times = defaultdict(list)
+        for part in parts:
+            for name, values in part.items():
+                use[name] += values
+        return {"registration": registered, "use": dict(use)}
+
+
+def report(kind: str, clients: int, found: dict[str, Times]) -> str:
+    registration, use = found["registration"], found["use"]
+    rows = [f"{kind}: {clients} clients, load average {os.getloadavg()[0]:.1f}",
+            "| | median | 95 % | worst |", "| --- | ---: | ---: | ---: |"]
+    for what, values in [
+        ("registration, accepted by the node", registration["submit"]), ("in a block", registration["include"]),
+        ("and two more on top", registration["confirm"]), ("write, accepted by the node", use["submit"]),
+        ("in a block", use["include"]), ("and two more on top", use["confirm"]), ("query", use["query"]),
+    ]:
+        ordered = sorted(values)
+        cells = [statistics.median(ordered), ordered[int(0.95 * (len(ordered) - 1))], ordered[-1]]
+        rows.append(f"| {what} | " + " | ".join(f"{1000 * cell:.1f} ms" for cell in cells) + " |")
+    writes, asked = WRITES * clients, QUERIES * clients
+    rows.append(f"registered {len(registration['written'])} of {clients}, written and confirmed"
+                f" {len(use['written'])} of {writes}, proven by the contract {len(use['answered'])} of {asked}")
+    return "\n".join(rows)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--clients", type=int, default=100)
+    parser.add_argument("--period", type=int, default=1, help="seconds between blocks")
+    parser.add_argument("--chain", choices=["clique", "anvil"], default="clique")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    try:
+        found = measure(options.chain, options.clients, options.period)
+    except clique.Unavailable as reason:
+        print(reason, file=sys.stderr)
+        return 1
+    print(report(options.chain, options.clients, found))
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    whole = len(found["use"]["written"]) == WRITES * options.clients
+    return 0 if whole and len(found["use"]["answered"]) == QUERIES * options.clients else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
