@@ -24,9 +24,11 @@ from rosbridge_eth.records import robot_id
 
 if TYPE_CHECKING:
     from rosbridge_eth.registry import Enrolment
+    from rosbridge_eth.store import Inbox
 
 _ETH = 10**18
 _ASK = 3.0  # seconds for a monitor to answer
+_DEAD_SHOWN = 1000  # the inbox's dead letters are counted by reason up to here
 _SHOWN = {
     "server": ("sessions", "records_total", "datagrams_received_total", "datagrams_dropped_total",
                "socket_overflows_total", "process_restarts_total"),
@@ -152,6 +154,7 @@ def _operator(place: OperatorHome) -> dict[str, Any]:
                       "bytes": held.bytes, "oldest_seconds": held.oldest_age},
             "batches": {str(state): count for state, count in journal.counts().items()},
             "dead_letters": journal.count_dead_letters(),
+            "dead": _dead(journal, inbox, names),
             "waiting_batches": _waiting(journal, names),
         }
     finally:
@@ -190,6 +193,15 @@ def _waiting(journal: ledger.Journal, names: Sequence[Enrolment]) -> list[dict[s
     ]
 
 
+def _dead(journal: ledger.Journal, inbox: Inbox, names: Sequence[Enrolment]) -> list[dict[str, Any]]:
+    """What will never be written, by robot and reason; of the inbox's the first thousand."""
+    robots = {robot_id(n.name): n.name for n in names if n.role == Role.ROBOT}
+    counts = Counter({(tk, reason): count for tk, reason, count in journal.dead_by_reason()})
+    counts.update((letter.record.id.robot, letter.reason) for letter in inbox.dead_letters(_DEAD_SHOWN))
+    return [{"robot": robots.get(tk, tk.hex()), "reason": reason, "records": count}
+            for (tk, reason), count in counts.items()]
+
+
 def _print_operator(report: dict[str, Any]) -> None:
     balances = report.get("balances", {})
     rows = [
@@ -217,6 +229,7 @@ def _print_operator(report: dict[str, Any]) -> None:
         ("last block", block),
         ("inbox waiting", f"{inbox['waiting'] + inbox['leased']} (oldest {oldest}), {inbox['bytes'] / 1024:.0f} KiB"),
         ("dead letters", inbox["dead"] + report["dead_letters"]),
+        *((f"of {each['robot']} dead", f"{each['records']} ({each['reason']})") for each in report["dead"]),
         *((f"batches {state}", count) for state, count in report["batches"].items()),
         *((f"of {each['robot']} wait", f"{each['batches']} batches ({each['why']})")
           for each in report["waiting_batches"]),

@@ -470,6 +470,10 @@ class Journal:
         """How many there are, without reading them."""
         return int(self._rows("SELECT count(*) FROM dead_letter")[0][0])
 
+    def dead_by_reason(self) -> list[tuple[bytes, str, int]]:
+        """Robot, reason and how many records, the latest last; without reading them."""
+        return self._rows("SELECT robot, reason, count(*) FROM dead_letter GROUP BY robot, reason ORDER BY max(at)")
+
     def dead_letters(self) -> list[DeadLetter]:
         rows = self._rows("SELECT robot, stream, seq, ciphertext, reason, at FROM dead_letter ORDER BY at")
         return [

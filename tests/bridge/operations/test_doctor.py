@@ -269,3 +269,21 @@ def test_status_says_whose_batches_wait_and_why(place: Place, capsys: Capture):
         "robot_1": (1, "revoked"), robot_id("stranger").hex(): (1, "not in the registry")}
     assert run(["status"]) == 0
     assert "of robot_1 wait" in capsys.readouterr().out
+
+
+def test_status_says_whose_records_will_never_be_written_and_why(place: Place, capsys: Capture):
+    deployment, config = place.operator.deployment(), load_server_config(place.operator.config)
+    journal, inbox = open_journal(place.operator, deployment), open_inbox(config, place.operator)
+    records = [SealedRecord(RecordId(robot_id("robot_1"), bytes(16), seq), bytes(100)) for seq in range(3)]
+    journal.seal([records], 0.0)
+    assert journal.give_up(robot_id("robot_1"), [], [], "given up", 0.0) == 3
+    fourth = RecordId(robot_id("robot_1"), bytes(16), 3)
+    inbox.append([SealedRecord(fourth, bytes(100)), SealedRecord(fourth, bytes(101))], 0.0)
+    inbox.close()
+    journal.close()
+    assert run(["status", "--json"]) == 0
+    dead = json.loads(capsys.readouterr().out)["dead"]
+    assert {(each["robot"], each["records"]) for each in dead} == {("robot_1", 3), ("robot_1", 1)}
+    assert {each["reason"] for each in dead if each["records"] == 3} == {"given up"}
+    assert run(["status"]) == 0
+    assert "3 (given up)" in capsys.readouterr().out
