@@ -1,4 +1,4 @@
-"""benchmarks/load.py as a module: it is a script, and no package has it."""
+"""The scripts of benchmarks/ as modules: no package has them."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "load.py"
+SCRIPTS = Path(__file__).parents[2] / "benchmarks"
 
 
 @cache
-def load_script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("load", SCRIPT)
+def load_script(name: str) -> ModuleType:
+    """benchmarks/NAME.py, run once."""
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
     if spec is None or spec.loader is None:
-        raise ImportError(f"{SCRIPT} cannot be loaded")
+        raise ImportError(f"{SCRIPTS / name}.py cannot be loaded")
     module = importlib.util.module_from_spec(spec)
-    sys.modules["load"] = module  # dataclasses look their module up
+    sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module

@@ -11,7 +11,7 @@ import pytest
 from bridge.load_script import load_script
 
 SESSIONS, MESSAGES, WORKERS = 80, 10, 2
-load = load_script()
+load = load_script("load")
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from rosbridge_eth.server.reception import Reception
 from rosbridge_eth.server.whereabouts import whereabouts
 from rosbridge_eth.store import State
 
-load = load_script()
+load = load_script("load")
 
 
 @pytest.fixture

@@ -7,32 +7,17 @@ fault by itself, FAULTS_SEED repeats a run, FAULTS_ROUNDS=N runs each N times.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import random
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from bridge.load_script import load_script
 from conftest import unavailable
 
-SOURCE = Path(__file__).resolve().parents[3] / "benchmarks" / "faults.py"
-
-
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("faults", SOURCE)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["faults"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-faults = _load()
+faults = load_script("faults")
 IN_SEVERAL = {"robot", "worker", "submitter", "network"}
 CHOSEN = [name for name in faults.FAULTS if os.environ.get("FAULTS") == "all" or name not in IN_SEVERAL]
 SEED = int(os.environ.get("FAULTS_SEED") or random.SystemRandom().randrange(1 << 31))

@@ -5,7 +5,6 @@ Reorganisations here are real: a node that was cut off made a block that the oth
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -14,12 +13,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from eth_account import Account
 
 from bridge.ledger.world import ACCOUNT, ETH, OPERATOR, ROBOT, Records
+from bridge.load_script import load_script
 from conftest import unavailable
 from rosbridge_eth import ledger
 from rosbridge_eth.ledger import failures, packing
@@ -34,18 +33,7 @@ from rosbridge_eth.sources.sample import sample_bag
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE = 90.0
-
-
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("clique", ROOT / "benchmarks" / "clique.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["clique"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-clique = _load()
+clique = load_script("clique")
 
 
 @pytest.fixture(scope="module")
