@@ -350,6 +350,9 @@ def test_a_publisher_with_another_definition_is_left_out_and_the_others_are_hear
     node.order(publish="/t", fields={"time_value": {"sec": 1}})
     watcher = ros.watcher('topics = ["/t"]')
     watcher.says("publishes with another definition of test_msgs/msg/Builtins than is installed here")
+    # Only now the one that latches nothing: on a busy machine a publisher may be discovered after half a minute, and
+    # what it had published before is given to who asks for the past, which nobody does beside one without any.
+    watcher.recorded(1)
     late = ros.node("/late", **swapped)
     late.order(create="/t", type=kind)
     late.order(**{"await": "/t"})
