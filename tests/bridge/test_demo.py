@@ -74,11 +74,16 @@ def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatc
 
     def stop_early(robot: Robot, *others: Any) -> None:
         progress(robot, *others)
-        if robot.recorder.times.records >= 100:
+        # Without a session it would stop with everything in its spool, as it should.
+        if robot.recorder.times.records >= 100 and robot.sender.statistics.connected:
             robot.stop()  # at the end once more, as a signal may come when all is done
 
     monkeypatch.setattr(demo, "_progress", stop_early)
-    stopped = run_demo(tmp_path, sample_bag())
+    for attempt in range(5):  # a machine that is busy may capture the whole bag before there is a session
+        (folder := tmp_path / str(attempt)).mkdir()
+        stopped = run_demo(folder, sample_bag())
+        if len(stopped.records) < 300:
+            break
     assert 100 <= len(stopped.records) < 300
     assert stopped.reading.complete  # nothing after the last record can have been withheld
     assert not stopped.passed
