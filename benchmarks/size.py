@@ -1,0 +1,99 @@
+"""How many lines of code the packages have, without blank lines, comments and docstrings.
+
+    python benchmarks/size.py [--files] [SOURCE_FOLDER]
+
+Counted are the lines on which a token of the program stands, so that a statement over five lines is five
+lines; a docstring is a string that stands first in a module, class or function. Lua counts without blank
+lines and comments. The contract and generated files (JSON) are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import tokenize
+from collections import Counter
+from pathlib import Path
+
+SOURCES = Path(__file__).resolve().parent.parent / "src"
+LARGEST_FILE = 400
+
+PARTS = {
+    "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py"),
+    "config": ("config", "config.py"),
+    "identity, home, registry, bundle, errors": (
+        "identity.py", "home.py", "registry.py", "bundle.py", "errors.py", "passphrases.py", "__init__.py",
+    ),
+    "capture": ("capture",),
+    "sources": ("sources",),
+    "chunk": ("chunk.py", "writer.py", "protocol.py"),
+    "channel": ("channel",),
+    "spool, inbox": ("spool.py", "inbox"),
+    "ledger": ("ledger",),
+    "robot, server": ("robot.py", "server.py", "robot", "server"),
+    "operations": ("metrics.py", "operations"),
+    "reading": ("reading",),
+}
+"""The rows of the design's table, by the first part of a file's path in the bridge's package."""
+
+_NO_CODE = {
+    tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING,
+    tokenize.ENDMARKER,
+}  # fmt: skip
+
+
+def _docstring_lines(source: str) -> set[int]:
+    lines: set[int] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            constant = first.value if isinstance(first, ast.Expr) else None
+            if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
+                lines.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    return lines
+
+
+def code_lines(path: Path) -> int:
+    """Lines of code of one Python or Lua file."""
+    source = path.read_text()
+    if path.suffix == ".lua":
+        return sum(1 for line in source.splitlines() if line.strip() and not line.strip().startswith("--"))
+    lines: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in _NO_CODE:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    return len(lines - _docstring_lines(source))
+
+
+def files_of(package: Path) -> dict[Path, int]:
+    """Of each Python and Lua file of a package, its lines of code."""
+    return {path: code_lines(path) for path in sorted(package.rglob("*")) if path.suffix in (".py", ".lua")}
+
+
+def part_of(path: Path) -> str:
+    """The row of the design's table to which a file (relative to the bridge's package) belongs."""
+    return next((part for part, names in PARTS.items() if path.parts[0] in names), "other")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="?", type=Path, default=SOURCES)
+    parser.add_argument("--files", action="store_true", help="every file, too")
+    arguments = parser.parse_args()
+    bridge, library = (files_of(arguments.sources / name) for name in ("rosbridge_eth", "smcrypto"))
+    package = arguments.sources / "rosbridge_eth"
+    parts: Counter[str] = Counter()
+    for path, lines in bridge.items():
+        parts[part_of(path.relative_to(package))] += lines
+        if arguments.files or lines > LARGEST_FILE:
+            print(f"{lines:7,}  {path.relative_to(package)}")
+    for part in [*PARTS, "other"]:
+        if parts[part]:
+            print(f"{parts[part]:7,}  {part}")
+    print(f"{sum(bridge.values()):7,}  rosbridge_eth, {len(bridge)} files")
+    print(f"{sum(library.values()):7,}  smcrypto, {len(library)} files")
+
+
+if __name__ == "__main__":
+    main()
