@@ -6,7 +6,7 @@ each with its X.509 certificate. The name stands in the subject alternative
 name `urn:rosbridge-eth:ROLE:NAME`; nothing else in a certificate is believed
 to say who somebody is.
 
-Every signature covers `"rosbridge-eth/1 " ‖ purpose ‖ 0x00 ‖ body`, so that
+Every signature covers `"rosbridge-eth/2 " ‖ purpose ‖ 0x00 ‖ body`, so that
 one made for a purpose means nothing for another.
 
 Not here: how certificates travel (channel), what is encrypted to whom (sealing).
@@ -180,7 +180,7 @@ class CertificateAuthority:
 def _message(purpose: str, body: bytes) -> bytes:
     if not _PURPOSE.match(purpose):
         raise ValueError(f"a purpose is lower-case letters and hyphens, not {purpose!r}")
-    return b"rosbridge-eth/1 " + purpose.encode("ascii") + b"\0" + body
+    return b"rosbridge-eth/2 " + purpose.encode("ascii") + b"\0" + body
 
 
 def sign(key: sm2.PrivateKey, purpose: str, body: bytes) -> bytes:
