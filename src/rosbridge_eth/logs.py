@@ -1,9 +1,8 @@
-"""Logs on stderr: one event is one line, as text or JSON, with the records it is about and never what is in them.
+"""Logs on stderr: one event is one line, as text or JSON; of a record it names the place and never the content.
 
-JSON has the members time (UTC), level, part, event, and, where there are any,
-records (robot/stream/seq in full) and failure (the exception's class and
-where it was raised). An exception's own text is shown only where the bridge
-wrote it: what others write may quote what they choked on.
+JSON has the members time (UTC), level, part, process, event and, where there is one, failure (the exception's class
+and where it was raised). An exception's own text is shown only where the bridge wrote it: what others write may quote
+what they could not read.
 """
 
 from __future__ import annotations
@@ -12,13 +11,11 @@ import json
 import logging
 import sys
 import traceback
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, TextIO
 
 from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.records import RecordId
 
 LOGGER = "rosbridge_eth"
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
@@ -29,19 +26,28 @@ class LogFormat(StrEnum):
     JSON = "json"
 
 
-def identity(id: RecordId) -> str:
-    """A record's name in full: robot/stream/seq."""
-    return f"{id.robot.hex()}/{id.stream.hex()}/{id.seq}"
+class Trouble:
+    """One thing that may fail and be well again: each change is logged once, the return to health too.
+
+    what: the sentence's subject, such as "the node".
+    """
+
+    def __init__(self, log: logging.Logger, what: str) -> None:
+        self._log, self._what = log, what
+        self.why: str | None = None
+
+    def now(self, why: str | None) -> None:
+        """Take the present state: the reason why it fails, None if it does not."""
+        if why is not None and why != self.why:
+            self._log.error("%s: %s", self._what, why)
+        elif why is None and self.why is not None:
+            self._log.warning("%s: well again", self._what)
+        self.why = why
 
 
 def one_line(text: str) -> str:
-    """The text with line breaks and control characters written out: nobody's words can make a line of their own."""
+    """The text with line breaks and control characters written out, so that foreign words never begin a line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-
-
-def _records(event: logging.LogRecord) -> Iterator[str]:
-    arguments = event.args if isinstance(event.args, tuple) else ()
-    yield from (identity(argument) for argument in arguments if isinstance(argument, RecordId))
 
 
 def _failure(event: logging.LogRecord) -> str:
@@ -59,7 +65,7 @@ def _time(event: logging.LogRecord) -> str:
 
 
 class TextFormatter(logging.Formatter):
-    """`2026-11-21T10:00:00.000Z INFO server.worker: robot robot_1: session begun`."""
+    """`2026-11-21T10:00:00.000Z INFO server: robot robot_1: session begun`."""
 
     def format(self, record: logging.LogRecord) -> str:
         failure = _failure(record)
@@ -78,18 +84,15 @@ class JsonFormatter(logging.Formatter):
             "process": record.processName,
             "event": record.getMessage(),
         }
-        if records := list(_records(record)):
-            event["records"] = records
         if failure := _failure(record):
             event["failure"] = failure
         return json.dumps(event)
 
 
 def log_to(stream: TextIO, format: LogFormat, verbosity: int) -> None:
-    """Send the bridge's logs to `stream`: warnings, with verbosity 1 what happens, with 2 every record.
+    """Send the bridge's logs to `stream`: warnings, with verbosity 1 what happens, with 2 every chunk.
 
-    Other packages' logs are shown from warnings on, whatever the verbosity:
-    theirs would name URLs and quote requests.
+    Other packages' logs are shown from warnings on, whatever the verbosity: theirs would name URLs and quote requests.
     """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter() if format is LogFormat.JSON else TextFormatter())

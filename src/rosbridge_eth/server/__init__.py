@@ -1,1 +1,0 @@
-"""The blockchain end: takes records from robots, keeps them until they are on the chain, answers where they are."""
