@@ -1,0 +1,400 @@
+"""The robot's end: captures, writes chunks into the spool, and brings to the server what it does not have.
+
+    source's thread -> ring -> Robot's loop: capture -> writer -> spool -> Sender -> channel
+
+The source's thread only puts raw messages into a bounded ring; everything that has state belongs to the loop.
+Where the ring is full a bag waits, and a live source drops and counts, which becomes `lost` lines of the log.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rosbridge_eth import protocol
+from rosbridge_eth.capture import Capture, Captured, RawMessage, definition_line
+from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason
+from rosbridge_eth.channel.udp import UdpLoop
+from rosbridge_eth.chunk import Chunk
+from rosbridge_eth.errors import NetworkError, StoreError
+from rosbridge_eth.logs import Trouble
+from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
+from rosbridge_eth.sources import Source
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.writer import LogWriter
+
+log = logging.getLogger(__name__)
+
+RING = 4096  # raw messages between the source's thread and the loop
+TAKE = 128  # raw messages captured before the network gets its turn again
+READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
+LONGEST_WAIT = 0.25
+LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source dropped
+SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
+SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
+MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
+LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
+CLOSING_TIME = 1.0  # seconds for the server to learn that the robot leaves
+SAY_AGAIN = 60.0  # seconds before the same reason for having no session is said once more
+
+_TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
+_TIMEX_SIZE = 512  # struct timex has 208 bytes on 64-bit Linux; modes = 0 in its first word asks and changes nothing
+
+
+def clock_synchronised() -> bool:
+    """Whether the kernel counts its clock as synchronised (NTP, PTP, chrony); False where it cannot be asked."""
+    adjtimex = getattr(ctypes.CDLL(None), "adjtimex", None) if sys.platform.startswith("linux") else None
+    return adjtimex is not None and 0 <= int(adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))) < _TIME_ERROR
+
+
+def mend(failure: HandshakeFailed, channel: str) -> str:
+    """What to do about a session that did not come about; `channel` is the configured mode."""
+    match failure.hint:
+        case Reason.NOT_ALLOWED | Reason.CERTIFICATE:
+            return (
+                "ask the operator, whose `status` says whether this robot is in force; if it was revoked or replaced,"
+                " have it registered again (`register --replace`) and `join` the new bundle in a new folder"
+            )
+        case Reason.EXPIRED:
+            return "see to this machine's clock; if the certificates have expired, have the robot registered again"
+        case Reason.FULL:
+            return "wait, or ask the operator for more [limits] connections"
+        case _:
+            return (
+                "is it up, is the address right, is UDP let through, and does it take"
+                f' channel = "{channel}" (`channel` in its server.toml)? `doctor` at this home tries it'
+            )
+
+
+@dataclass(slots=True)
+class SenderStatistics:
+    """Chunks by what became of them in this process, and the session."""
+
+    sent: int = 0
+    refused: int = 0
+    sessions: int = 0
+    connected: bool = False
+    held: str | None = None
+    """Why the server wants nothing at this moment."""
+    refusal: str | None = None
+    """Why there has been no session since the last one, and what to do about it."""
+
+
+class Sender:
+    """From the spool through the channel: asks what the server has of a stream, and sends what follows. Sans-IO.
+
+    begin_stream: called when the server refused the stream that is being written. on_server_time: is given the
+    server's authenticated time (seconds since 1970) at each new session.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        spool: Spool,
+        *,
+        channel: str = "exchange",
+        begin_stream: Callable[[bytes], None] = lambda stream: None,
+        on_server_time: Callable[[float], None] = lambda seconds: None,
+    ) -> None:
+        self._client, self._spool, self._channel = client, spool, channel
+        self._begin_stream, self._on_server_time = begin_stream, on_server_time
+        self._said: dict[str, float] = {}  # reason for having no session -> when it was said
+        self._stream: bytes | None = None  # being sent; None: the next one is to be asked about
+        self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
+        self._stored: int | None = None  # the newest number of it that the server has
+        self._asked = False  # a question is out, or a hold is on: nothing is sent until the next Stored
+        self.statistics = SenderStatistics()
+
+    @property
+    def idle(self) -> bool:
+        """The server has all that the spool has."""
+        return self._spool.statistics().unstored == 0
+
+    def send(self, now: float) -> None:
+        """Send as much as the session takes."""
+        if not self.statistics.connected or self._asked:
+            return
+        if self._stream is None:
+            self._ask(self._spool.first_unconfirmed(), now)
+            return
+        for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
+            message = protocol.encode(Offer(chunk.encoded))
+            if not self._client.writable(now, len(message)):
+                return
+            self._client.send(message)
+            self._sent = chunk.header.number
+            self.statistics.sent += 1
+            self._client.expecting(True)
+        if self._sent == self._stored:
+            self._ask(self._spool.next_stream(self._stream), now)
+
+    def _ask(self, place: tuple[bytes, int, bytes] | None, now: float) -> None:
+        question = None if place is None else protocol.encode(Where(*place))
+        if place is not None and question is not None and self._client.writable(now, len(question)):
+            self._client.send(question)
+            self._stream, self._sent, self._stored, self._asked = place[0], None, None, True
+            self._client.expecting(True)
+
+    def handle(self, event: Event, now: float) -> None:
+        """Take one event of the client. Raises NetworkError where the server says what is no message of ours."""
+        match event:
+            case Connected(peer=peer, server_time=server_time):
+                self.statistics.sessions += 1
+                self.statistics.connected = True
+                self.statistics.refusal = None
+                self._stream, self._asked = None, False
+                log.info("connected to %s", peer)
+                if server_time is not None:
+                    self._on_server_time(server_time.timestamp())
+            case Disconnected(reason=reason):
+                self.statistics.connected, self.statistics.held = False, None
+                log.info("disconnected: %s", reason)
+            case HandshakeFailed(why=why):
+                self.statistics.refusal = f"{why}; {mend(event, self._channel)}"
+                if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:  # not at every attempt
+                    self._said[why] = now
+                    log.warning("no session: %s", self.statistics.refusal)
+            case Message(payload=payload):
+                try:
+                    self._take(protocol.decode_down(payload))
+                except ProtocolError as error:  # nothing is lost: what is not confirmed is in the spool
+                    raise NetworkError(
+                        f"the server says what is no message here ({error}); use the same version on both ends"
+                    ) from error
+
+    def _take(self, message: Stored | Confirmed | Hold | Refused) -> None:
+        match message:
+            case Stored() if self.statistics.held is not None:  # it takes chunks again: ask from the beginning
+                self._stream, self._asked, self.statistics.held = None, False, None
+            case Stored(stream=stream, number=number) if stream == self._stream:
+                if self._asked:  # the server's word for what is there, ours for what follows
+                    self._sent, self._asked = number, False
+                self._stored = number
+                if number is not None:
+                    self._spool.stored(stream, number)
+                    self._client.progressed()
+                self._client.expecting(self._sent != self._stored)
+                log.debug("stream %s: the server has it up to %s", stream.hex(), number)
+            case Confirmed(stream=stream, number=number):
+                self._spool.confirmed(stream, number)
+                log.debug("stream %s: confirmed up to %d", stream.hex(), number)
+            case Hold(why=why):
+                self._asked, self.statistics.held = True, why
+                self._client.expecting(False)
+                log.warning("the server takes nothing at this moment: %s", why)
+            case Refused(stream=stream, number=number, why=why):
+                aside = self._spool.set_aside(stream, number)
+                self.statistics.refused += aside
+                log.error(
+                    "the server refuses chunk %d of stream %s: %s; %d chunks are set aside and a new stream begins",
+                    number, stream.hex(), why, aside,
+                )
+                self._begin_stream(stream)
+                if stream == self._stream:
+                    self._stream, self._asked = None, False
+                    self._client.expecting(False)
+
+
+class Robot:
+    """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called.
+
+    on_captured: called with each record, in the loop's thread.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: Source,
+        capture: Capture,
+        writer: LogWriter,
+        spool: Spool,
+        client: Client,
+        loop: UdpLoop,
+        sender: Sender,
+        on_captured: Callable[[Captured], None] = lambda record: None,
+    ) -> None:
+        self.capture, self.writer, self.spool = capture, writer, spool
+        self.client, self.loop, self.sender = client, loop, sender
+        self.source = source
+        self.captured = 0
+        self.chunks = 0
+        self._on_captured = on_captured
+        self._ring: deque[RawMessage] = deque()
+        self._room = threading.Event()
+        self._stop = threading.Event()
+        self._source_ended = threading.Event()
+        self._source_error: BaseException | None = None
+        self._unspooled: deque[Chunk] = deque()
+        self._spool_at = float("-inf")
+        self._losses_at = float("-inf")
+        self._synchronised, self._synchronised_at = False, float("-inf")
+        self.summary = ""
+        """What became of everything, in one line, after `run`."""
+        self.spool_trouble = Trouble(log, "the spool")
+
+    def stop(self) -> None:
+        """Let `run` come to an end, from any thread or a signal handler; what is not stored stays in the spool."""
+        self._stop.set()
+        self.loop.wake()
+
+    def begin_stream(self, refused: bytes) -> None:
+        """The server refused a stream: if it is the one being written, go on in a new one."""
+        if refused == self.writer.stream:
+            self.writer.new_stream()
+
+    def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
+        """Until `stop`, or until the source has ended and the server has everything.
+
+        on_turn: called at every turn of the loop, to show progress. Raises what the source raised, after everything
+        that was captured is delivered.
+        """
+        reading = threading.Thread(target=self._read, name="source", daemon=True)
+        reading.start()
+        finished = False
+        try:
+            while not self._stop.is_set():
+                now = time.monotonic()
+                self._take(now)
+                if not finished and self._source_ended.is_set() and not self._ring:
+                    finished = True
+                    self._finish(now)
+                elif not finished:
+                    self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
+                self.sender.send(now)
+                on_turn()
+                if finished and not self._unspooled and self.sender.idle:
+                    break
+                self.loop.step(self._wait(now, finished))
+            else:
+                while self._ring and len(self._unspooled) < MAX_UNSPOOLED:
+                    self._take(time.monotonic())
+                if not finished:
+                    self._finish(time.monotonic())
+                self._last_words()
+        finally:
+            self._stop.set()
+            self._room.set()
+            self._leave()
+            self.source.close()
+            reading.join(timeout=5)
+            self.summary = self._summarise()
+            self.spool.close()
+            self.loop.close()
+        if self._source_error is not None:
+            raise self._source_error
+
+    # The source's thread
+
+    def _read(self) -> None:
+        try:
+            self.source.run(self._emit, self._stop)
+        except BaseException as error:  # kept and raised in the thread that waits for this one
+            self._source_error = error
+        finally:
+            self._source_ended.set()
+            self.loop.wake()
+
+    def _emit(self, raw: RawMessage) -> None:
+        while len(self._ring) >= RING and not self._stop.is_set():
+            self._room.clear()
+            if len(self._ring) >= RING:
+                self._room.wait(0.2)
+        self._ring.append(raw)
+        if len(self._ring) == 1:
+            self.loop.wake()
+
+    # The loop's thread
+
+    def _take(self, now: float) -> None:
+        if now - self._synchronised_at > SYNCHRONISED_EVERY:
+            self._synchronised, self._synchronised_at = clock_synchronised(), now
+        for _ in range(TAKE):
+            if not self._ring or len(self._unspooled) >= MAX_UNSPOOLED:
+                break
+            raw = self._ring.popleft()
+            record = self.capture.process(raw, time.time_ns(), self._synchronised)
+            if record is not None:
+                self.writer.add(
+                    record.line, now, type_name=record.type_name,
+                    definition_line=lambda decoder=raw.decoder: definition_line(decoder),  # type: ignore[misc]
+                )
+                self.captured += 1
+                self._on_captured(record)
+        if len(self._ring) < RING // 2:
+            self._room.set()
+        if now - self._losses_at >= LOSSES_EVERY:
+            self._losses_at = now
+            self._add_losses(now)
+
+    def _add_losses(self, now: float) -> None:
+        for line in self.capture.lost(self.source.dropped):
+            self.writer.add(line, now)
+
+    def _finish(self, now: float) -> None:
+        self._add_losses(now)
+        self._spool_chunks(self.writer.finish(time.time_ns() // 10**6), now)
+
+    def _spool_chunks(self, chunks: list[Chunk], now: float) -> None:
+        """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the ring."""
+        self._unspooled.extend(chunks)
+        self.chunks += len(chunks)
+        if self.spool_trouble.why is not None and now - self._spool_at < SPOOL_AGAIN:
+            return
+        self._spool_at = now
+        try:
+            while self._unspooled:
+                self.spool.append(self._unspooled[0])
+                self._unspooled.popleft()
+        except StoreError as error:
+            self.spool_trouble.now(str(error))
+        else:
+            self.spool_trouble.now(None)
+
+    def _wait(self, now: float, finished: bool) -> float:
+        if self._ring and len(self._unspooled) < MAX_UNSPOOLED:
+            return 0.0
+        due = LONGEST_WAIT if finished else self.writer.next_timer() - now
+        return max(0.0, min(LONGEST_WAIT, due))
+
+    def _last_words(self) -> None:
+        """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
+        deadline = time.monotonic() + LAST_WORDS_TIME
+        while self.sender.statistics.connected and not self.sender.idle and (now := time.monotonic()) < deadline:
+            self._spool_chunks([], now)
+            self.sender.send(now)
+            self.loop.step(0.02)
+
+    def _leave(self) -> None:
+        """End the session in good order, so that the server need not wait for a silent robot."""
+        now = time.monotonic()
+        deadline = now + CLOSING_TIME
+        self.client.close(now)
+        while self.client.next_timer() is not None and time.monotonic() < deadline:
+            self.loop.step(0.05)
+
+    def _summarise(self) -> str:
+        spool, sender = self.spool.statistics(), self.sender.statistics
+        left = spool.unstored + len(self._unspooled)
+        lost = {
+            "messages dropped because they came too fast": sum(self.source.dropped.values()),
+            "messages left out as too large or undecodable": self.capture.refused,
+            "chunks dropped from the full spool": spool.dropped_bodies,
+            "chunks refused by the server": sender.refused,
+        }
+        parts = [f"{self.captured} records captured in {self.chunks} chunks"]
+        parts += [f"{count} {what}" for what, count in lost.items() if count]
+        parts += [f"{left} chunks kept for later"]
+        line = ", ".join(parts)
+        if not left:
+            return f"{line}."
+        if sender.refusal is not None:
+            return f"{line}: {sender.refusal}."
+        if not sender.sessions:
+            return f"{line}: there was no session yet when it was stopped."
+        return f"{line}: it was stopped before the server had them; the next start sends them."

@@ -1,0 +1,297 @@
+"""The robots' door: what a worker of the server answers to the chunks that its robots offer.
+
+A chunk is taken if its header is well formed, its body's digest is right, its signature holds under the certificate
+that the contract has for this robot now, and the inbox takes it (its number is higher than the stream's last). All
+robots' chunks of one turn are committed together, and answered after. Sans-IO: drives a channel.Server and an Inbox.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from rosbridge_eth import protocol
+from rosbridge_eth.channel import AddressChanged, Connected, Disconnected, End, Event, Message, Server
+from rosbridge_eth.channel.udp import UdpLoop
+from rosbridge_eth.chunk import Altered, Chunk, ChunkError, Forged, Log, robot_id, verify
+from rosbridge_eth.errors import StoreError
+from rosbridge_eth.identity import PeerIdentity
+from rosbridge_eth.inbox import Head, Inbox, Outcome
+from rosbridge_eth.logs import Trouble
+from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
+
+log = logging.getLogger(__name__)
+
+TURN = 0.05  # seconds that chunks are gathered for one commit
+LOOK_EVERY = 1.0  # seconds between looks at what the submitter and the operator changed
+HELD = 5.0  # seconds before a robot that was told to hold is asked to go on
+LONGEST_WAIT = 0.5
+ALIVE = 10.0  # seconds after its last message in which a session counts as alive
+MISMATCH = "the contract has other certificates for this robot; the operator's `status` says more"
+_NO_DIGEST = bytes(32)
+
+
+@dataclass(slots=True)
+class Session:
+    """A robot that is connected. Streams are named by their 16 bytes."""
+
+    connection: bytes
+    peer: PeerIdentity
+    tk: bytes
+    heard: float
+    stream: bytes | None = None  # the one it asked about last
+    held: bool = False  # told to hold: its offers are passed over until it asks again
+    ask_at: float = 0.0  # when a robot that holds is told what is stored, so that it asks again
+    refused: bytes | None = None  # the stream whose rest is passed over until it asks again
+    mismatch: str | None = None  # why nothing is taken from it although the session stands
+    confirmed: tuple[bytes, int] | None = None  # what it was told last
+    offers: list[Chunk] = field(default_factory=list)
+
+
+class Reception:
+    """Answers the robots of one worker.
+
+    certificates: keccak256 of the certificates that the operator's registry has in force for a name, None where the
+    name has none; the contract's are in the inbox's state. allowed: whether a session may go on.
+    counts: chunks by outcome; records: by robot's name, those stored.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        inbox: Inbox,
+        ledger: bytes,
+        *,
+        allowed: Callable[[PeerIdentity], bool],
+        certificates: Callable[[str], bytes | None],
+    ) -> None:
+        self._server, self._inbox, self._ledger = server, inbox, ledger
+        self._allowed, self._certificates = allowed, certificates
+        self.sessions: dict[bytes, Session] = {}
+        self._gone: dict[str, Session] = {}  # by name: sessions that a newer one of the same identity replaced
+        self._asked: list[Session] = []
+        self._commit_at: float | None = None
+        self._look_at = float("-inf")
+        self.counts: Counter[str] = Counter()
+        self.records: Counter[str] = Counter()
+        self.trouble = Trouble(log, "the inbox")
+
+    # From the channel
+
+    def handle(self, event: Event, now: float) -> None:
+        """Take one event; what it asks for is answered by `commit`."""
+        match event:
+            case Connected(peer=peer, connection=connection):
+                session = Session(connection, peer, robot_id(peer.name), now)
+                self.sessions[connection] = session
+                self._compare(session, self._gone.pop(peer.name, None), now)
+                log.info("%s: session begun", peer)
+                self._look_at = now  # its handshake may have been allowed before the list changed
+            case Disconnected(reason=reason, connection=connection):
+                ended = self.sessions.pop(connection, None)
+                if ended is not None:
+                    log.info("%s: session ended, %s", ended.peer, reason)
+                    if reason is End.REPLACED:
+                        self._gone[ended.peer.name] = ended
+            case AddressChanged(peer=peer):
+                log.info("%s: goes on from another address", peer)
+            case Message(connection=connection, payload=payload):
+                found = self.sessions.get(connection)
+                if found is not None:
+                    found.heard = now
+                    self._take(found, payload, now)
+
+    def _take(self, session: Session, payload: bytes, now: float) -> None:
+        try:
+            message = protocol.decode_up(payload)
+        except ProtocolError as error:
+            log.warning("%s: %s; its session is closed", session.peer, error)
+            self._server.close_connection(session.connection, now, End.PROTOCOL)
+            return
+        match message:
+            case Where(stream=stream):
+                # Messages are in order: what it offers from here on was chosen after our answer to this.
+                session.stream, session.held, session.refused = stream, False, None
+                self._asked.append(session)
+            case Offer(chunk=encoded):
+                if session.held:
+                    return
+                chunk = self._checked(session, encoded, now)
+                if chunk is None or chunk.header.stream == session.refused:
+                    return
+                if session.mismatch is not None:
+                    self._hold([session], session.mismatch, now)
+                    return
+                session.offers.append(chunk)
+        if self._commit_at is None:
+            self._commit_at = now + TURN
+
+    def _checked(self, session: Session, encoded: bytes, now: float) -> Chunk | None:
+        """The chunk if it is this robot's, well formed and signed; otherwise it is refused, or nothing is said."""
+        try:
+            chunk = Chunk.parse(encoded)
+        except ChunkError as error:
+            self.counts["malformed"] += 1
+            log.warning("%s: sends what is no chunk (%s); its session is closed", session.peer, error)
+            self._server.close_connection(session.connection, now, End.PROTOCOL)
+            return None
+        try:
+            verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, chunk)
+        except (Forged, Altered) as error:
+            self._refuse(session, chunk, str(error))
+            return None
+        return chunk
+
+    # The turn's commit
+
+    def next_timer(self) -> float:
+        """When `commit` or `look` has something to do although no event came."""
+        return self._look_at if self._commit_at is None else min(self._commit_at, self._look_at)
+
+    def turn(self, now: float, wall: float) -> None:
+        """Commit what was gathered, if its time has come, and look once a second at what others changed.
+
+        wall: seconds since 1970, for the inbox.
+        """
+        if self._commit_at is not None and (now >= self._commit_at or self._enough()):
+            self._commit_at = None
+            self.commit(now, wall)
+        if now >= self._look_at:
+            self._look_at = now + LOOK_EVERY
+            self.look(now)
+
+    def _enough(self) -> bool:
+        return sum(len(session.offers) for session in self.sessions.values()) >= 64
+
+    def commit(self, now: float, wall: float) -> None:
+        """Everything gathered goes into the inbox by one commit; then each robot is answered."""
+        gathered = [(session, chunk) for session in self.sessions.values() for chunk in session.offers]
+        asked, self._asked = self._asked, []
+        for session in self.sessions.values():
+            session.offers = []
+        try:
+            outcomes = self._inbox.append([(session.tk, chunk) for session, chunk in gathered], wall)
+            self.trouble.now(None)
+        except StoreError as error:
+            self.trouble.now(str(error))
+            self._hold([*asked, *(session for session, _ in gathered)], "the server's store is away", now)
+            return
+        answers: dict[int, Session] = {id(session): session for session in asked}
+        for (session, chunk), outcome in zip(gathered, outcomes, strict=True):
+            self._take_outcome(session, chunk, outcome, answers, now)
+        for session in answers.values():
+            self._say_stored(session, now)
+
+    def _take_outcome(
+        self, session: Session, chunk: Chunk, outcome: Outcome, answers: dict[int, Session], now: float
+    ) -> None:
+        self.counts[outcome.name.lower()] += 1
+        match outcome:
+            case Outcome.STORED | Outcome.KNOWN:
+                if outcome is Outcome.STORED:
+                    self.records[session.peer.name] += chunk.header.records
+                session.stream = chunk.header.stream
+                answers[id(session)] = session
+            case Outcome.DIFFERENT:
+                if chunk.header.stream != session.refused:
+                    self._refuse(session, chunk, "another chunk with this number is there")
+            case Outcome.FULL:
+                self._hold([session], "the room for this robot's chunks is full until some are on the chain", now)
+
+    def _say_stored(self, session: Session, now: float) -> None:
+        if session.mismatch is not None:
+            self._hold([session], session.mismatch, now)
+        if session.stream is None or session.held:
+            return
+        self._answer(session, now)
+
+    def _answer(self, session: Session, now: float) -> None:
+        if session.stream is None:
+            return
+        try:
+            head: Head | None = self._inbox.head(session.tk, session.stream)
+        except StoreError as error:
+            self.trouble.now(str(error))
+            self._hold([session], "the server's store is away", now)
+            return
+        number, digest = (None, _NO_DIGEST) if head is None else head
+        self._send(session, Stored(session.stream, number, digest))
+
+    # Once a second
+
+    def look(self, now: float) -> None:
+        """Tell what is confirmed, ask those that hold to go on, close the sessions of who is not allowed any more."""
+        for session in list(self.sessions.values()):
+            if not self._allowed(session.peer):
+                log.warning("%s is no longer allowed; its session is closed", session.peer)
+                self._server.close_peer(session.peer.name, now, role=session.peer.role)
+                continue
+            try:
+                state = self._inbox.state(session.tk)
+            except StoreError as error:
+                self.trouble.now(str(error))
+                return
+            ours = (None, self._certificates(session.peer.name))
+            session.mismatch = None if state.certificates_hash in ours else MISMATCH
+            if state.confirmed is not None and state.confirmed != session.confirmed:
+                session.confirmed = state.confirmed
+                self._send(session, Confirmed(*state.confirmed))
+            if session.held and now >= session.ask_at and session.mismatch is None:
+                session.ask_at = now + HELD
+                self._answer(session, now)
+
+    # Answers
+
+    def _hold(self, sessions: Iterable[Session], why: str, now: float) -> None:
+        for session in sessions:
+            if not session.held:
+                session.held, session.ask_at = True, now + HELD
+                self._send(session, Hold(why))
+
+    def _refuse(self, session: Session, chunk: Chunk, why: str) -> None:
+        self.counts["refused"] += 1
+        session.refused = chunk.header.stream
+        log.error("%s: chunk %d of stream %s is refused: %s", session.peer, chunk.header.number,
+                  chunk.header.stream.hex(), why)
+        self._send(session, Refused(chunk.header.stream, chunk.header.number, why))
+
+    def _send(self, session: Session, message: Stored | Confirmed | Hold | Refused) -> None:
+        encoded = protocol.encode(message)
+        if self._server.writable(session.connection, len(encoded)):
+            self._server.send(session.connection, encoded)
+        else:  # it takes none of our packets: it comes back with a new session, and asks
+            log.warning("%s: takes no answers; its session is closed", session.peer)
+            self._server.close_connection(session.connection, time.monotonic())
+
+    def _compare(self, session: Session, before: Session | None, now: float) -> None:
+        """A session that took the place of a living one: perhaps two machines have one identity."""
+        if before is not None and now - before.heard <= ALIVE:
+            log.warning(
+                "%s: a session took the place of one that was alive: the robot was killed and started again, or two"
+                " machines have its identity; then revoke it and register it anew", session.peer,
+            )
+
+
+class Worker:
+    """Drives a Reception over a socket until told to stop."""
+
+    def __init__(
+        self, server: Server, reception: Reception, make_loop: Callable[[Callable[[Event], None]], UdpLoop]
+    ) -> None:
+        self.server, self.reception = server, reception
+        self.loop = make_loop(lambda event: reception.handle(event, time.monotonic()))
+
+    def run(self, stopped: Callable[[], bool], *, on_turn: Callable[[], None] = lambda: None) -> None:
+        """Until `stopped()`; then every session is ended in good order. on_turn: called after every step."""
+        while not stopped():
+            wait = self.reception.next_timer() - time.monotonic()
+            self.loop.step(max(0.0, min(LONGEST_WAIT, wait)))
+            self.reception.turn(time.monotonic(), time.time())
+            on_turn()
+        self.reception.commit(time.monotonic(), time.time())
+        self.server.close(time.monotonic())
+        self.loop.step(0.0)
+        self.loop.close()
