@@ -1,8 +1,8 @@
 """What the processes count, as Prometheus has it, and the HTTP server of /metrics, /healthz and /readyz.
 
 The server's processes share their counts by prometheus_client's multiprocess mode: files in a folder that the
-environment names before this module is first imported (supervisor.py). The table of docs/operations.md is `reference`. The server is healthy while its processes beat, and
-ready when every condition holds, too.
+environment names before this module is first imported (supervisor.py). The table of docs/operations.md is
+`reference`. The server is healthy while its processes beat, and ready when every condition holds, too.
 """
 
 from __future__ import annotations
