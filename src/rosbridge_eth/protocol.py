@@ -1,148 +1,141 @@
-"""What a robot and a server say to each other inside the channel: requests and their answers.
+"""What a robot and a server say to each other inside the channel, one message each. Numbers are big-endian.
 
-A channel message is one request; its reply is the answer. A record's answer
-is its acknowledgement and follows the server's commit. Layout, big-endian:
+    up      WHERE      01 | stream 16 | number 8 | digest 32
+            OFFER      02 | chunk
+    down    STORED     11 | stream 16 | 00, or 01 | number 8 | digest 32     00: nothing of this stream is stored
+            CONFIRMED  12 | stream 16 | number 8
+            HOLD       13 | why, UTF-8, at most 400 bytes
+            REFUSED    14 | stream 16 | number 8 | why
 
-    RECORD    01 | stream 16 | seq 8 | ciphertext     answer: one Ack byte
-    CHECK     02 | stream 16 | seq 8                  answer: JSON RecordStatus
-    REGISTER  03                                      answer: JSON Registration
-
-The robot is never named: it is who the channel authenticated.
+The robot says which chunk of which stream it would send next; the server answers what it has stored of that
+stream, and the robot goes on from there. The robot is never named: it is who the channel authenticated.
 """
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
-from enum import IntEnum
+import struct
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from rosbridge_eth.records import STREAM_ID_SIZE, RecordId, SealedRecord
+from rosbridge_eth.chunk import MAX_CHUNK
 
-_RECORD, _CHECK, _REGISTER = 1, 2, 3
-_ID_SIZE = STREAM_ID_SIZE + 8
+MAX_WHY = 400
+
+_WHERE, _OFFER, _STORED, _CONFIRMED, _HOLD, _REFUSED = 0x01, 0x02, 0x11, 0x12, 0x13, 0x14
+_WHERE_FORM, _STORED_FORM, _PLACE_FORM = struct.Struct(">B16sQ32s"), struct.Struct(">B16s?Q32s"), struct.Struct(">B16sQ")
 
 
 class ProtocolError(Exception):
-    """The peer sent a request or an answer that is not one; the session is of no use any more."""
-
-
-class Ack(IntEnum):
-    """How the server answers a record. Only STORED lets the robot forget it."""
-
-    STORED = 0  # on disk, now or before
-    CONFLICT = 1  # this identity is taken by other bytes; kept as a dead letter
-    BUSY = 2  # the inbox is full; send again later
-    REFUSED = 3  # not a record this server takes (too long, or the robot was revoked)
+    """The peer sent what is not a message; the session is of no use any more."""
 
 
 @dataclass(frozen=True, slots=True)
-class RecordRequest:
-    record: SealedRecord
+class Where:
+    """Up: I would send this chunk of this stream next; the answer is Stored, or Hold."""
+
+    stream: bytes
+    number: int
+    digest: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class CheckRequest:
-    id: RecordId
+class Offer:
+    """Up: one encoded chunk."""
+
+    chunk: bytes = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
-class RegisterRequest:
-    """The robot asks what the server and the chain know of it."""
+class Stored:
+    """Down: the newest chunk of that stream that is committed; None and zeros if there is none."""
 
-
-Request: TypeAlias = RecordRequest | CheckRequest | RegisterRequest
-
-
-@dataclass(frozen=True, slots=True)
-class RecordStatus:
-    """Where a record is: 'unknown', 'stored', 'batched', 'submitted', 'included', 'confirmed', 'dead'.
-
-    'unavailable': the server cannot look at this moment; ask again.
-    """
-
-    state: str
-    transaction: str | None = None
-    block: int | None = None
+    stream: bytes
+    number: int | None
+    digest: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Registration:
-    """What the chain end knows of the asking robot; `server_time` is UTC seconds, to correct a bad clock."""
+class Confirmed:
+    """Down: everything of the log up to this chunk is confirmed on the chain."""
 
-    registered: bool
-    account: str | None
-    contract: str
-    chain_id: int
-    server_time: int
+    stream: bytes
+    number: int
 
 
-def _pack_id(id: RecordId) -> bytes:
-    return id.stream + id.seq.to_bytes(8, "big")
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Down: send nothing until the next Stored."""
+
+    why: str
 
 
-def encode_request(request: Request) -> bytes:
-    match request:
-        case RecordRequest(record):
-            return bytes([_RECORD]) + _pack_id(record.id) + record.ciphertext
-        case CheckRequest(id):
-            return bytes([_CHECK]) + _pack_id(id)
-        case RegisterRequest():
-            return bytes([_REGISTER])
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Down: this chunk will never be taken."""
+
+    stream: bytes
+    number: int
+    why: str
 
 
-def decode_request(payload: bytes, robot: bytes) -> Request:
-    """Parse a request of the robot (Tk) whose session it arrived in; ProtocolError if it is none."""
-    kind, body = payload[:1], payload[1:]
-    if kind == bytes([_REGISTER]) and not body:
-        return RegisterRequest()
-    if kind not in (bytes([_RECORD]), bytes([_CHECK])) or len(body) < _ID_SIZE:
-        raise ProtocolError(f"not a request: {len(payload)} bytes")
-    id = RecordId(robot, body[:STREAM_ID_SIZE], int.from_bytes(body[STREAM_ID_SIZE:_ID_SIZE], "big"))
-    rest = body[_ID_SIZE:]
-    if kind == bytes([_RECORD]):
-        if not rest:
-            raise ProtocolError("a record without ciphertext")
-        return RecordRequest(SealedRecord(id, rest))
-    if rest:
-        raise ProtocolError("a check request with trailing bytes")
-    return CheckRequest(id)
+Up: TypeAlias = Where | Offer
+Down: TypeAlias = Stored | Confirmed | Hold | Refused
 
 
-def encode_ack(ack: Ack) -> bytes:
-    return bytes([ack])
+def encode(message: Up | Down) -> bytes:
+    """The message as bytes. A reason is cut to MAX_WHY bytes, and what does not print in it becomes a space."""
+    match message:
+        case Where(stream, number, digest):
+            return _WHERE_FORM.pack(_WHERE, stream, number, digest)
+        case Offer(chunk):
+            return bytes((_OFFER,)) + chunk
+        case Stored(stream, number, digest):
+            return _STORED_FORM.pack(_STORED, stream, number is not None, number or 0, digest)
+        case Confirmed(stream, number):
+            return _PLACE_FORM.pack(_CONFIRMED, stream, number)
+        case Hold(why):
+            return bytes((_HOLD,)) + _reason(why)
+        case Refused(stream, number, why):
+            return _PLACE_FORM.pack(_REFUSED, stream, number) + _reason(why)
 
 
-def decode_ack(payload: bytes) -> Ack:
-    if len(payload) != 1 or payload[0] not in {ack.value for ack in Ack}:
-        raise ProtocolError("not an acknowledgement")
-    return Ack(payload[0])
+def _reason(why: str) -> bytes:
+    printable = "".join(letter if letter.isprintable() else " " for letter in why)
+    return printable.encode("utf-8", "replace")[:MAX_WHY].decode("utf-8", "ignore").encode("utf-8")
 
 
-def encode_answer(answer: RecordStatus | Registration) -> bytes:
-    return json.dumps(asdict(answer), separators=(",", ":")).encode()
-
-
-def _fields(payload: bytes) -> dict[str, object]:
+def _why(data: bytes) -> str:
     try:
-        fields = json.loads(payload)
-    except ValueError as error:
-        raise ProtocolError("an answer that is not JSON") from error
-    if not isinstance(fields, dict):
-        raise ProtocolError("an answer that is not a JSON object")
-    return fields
+        why = data.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ProtocolError("a reason that is not UTF-8") from None
+    if len(data) > MAX_WHY or not why.isprintable():
+        raise ProtocolError("a reason that is too long or does not print")
+    return why
 
 
-def decode_status(payload: bytes) -> RecordStatus:
-    match _fields(payload):
-        case {"state": str(state), "transaction": str() | None as transaction, "block": int() | None as block}:
-            return RecordStatus(state, transaction, block)
-    raise ProtocolError("not the status of a record")
+def decode_up(data: bytes) -> Up:
+    """What a robot sent; ProtocolError if it is none of its messages. A chunk is not looked into."""
+    if data[:1] == bytes((_WHERE,)) and len(data) == _WHERE_FORM.size:
+        return Where(*_WHERE_FORM.unpack(data)[1:])
+    if data[:1] == bytes((_OFFER,)) and 1 < len(data) <= 1 + MAX_CHUNK:
+        return Offer(data[1:])
+    raise ProtocolError(f"not a robot's message: {len(data)} bytes")
 
 
-def decode_registration(payload: bytes) -> Registration:
-    match _fields(payload):
-        case {"registered": bool(registered), "account": str() | None as account, "contract": str(contract),
-              "chain_id": int(chain_id), "server_time": int(server_time)}:
-            return Registration(registered, account, contract, chain_id, server_time)
-    raise ProtocolError("not a registration")
+def decode_down(data: bytes) -> Down:
+    """What a server sent; ProtocolError if it is none of its messages."""
+    kind = data[0] if data else 0
+    if kind == _STORED and len(data) == _STORED_FORM.size and data[17] in (0, 1):
+        _, stream, known, number, digest = _STORED_FORM.unpack(data)
+        if not known and (number or any(digest)):
+            raise ProtocolError("a stream of which nothing is stored, with a chunk")
+        return Stored(stream, number if known else None, digest)
+    if kind == _CONFIRMED and len(data) == _PLACE_FORM.size:
+        return Confirmed(*_PLACE_FORM.unpack(data)[1:])
+    if kind == _HOLD:
+        return Hold(_why(data[1:]))
+    if kind == _REFUSED and len(data) >= _PLACE_FORM.size:
+        _, stream, number = _PLACE_FORM.unpack_from(data)
+        return Refused(stream, number, _why(data[_PLACE_FORM.size :]))
+    raise ProtocolError(f"not a server's message: {len(data)} bytes")
