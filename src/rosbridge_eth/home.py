@@ -1,28 +1,32 @@
-"""The folders the commands work in: what stands where at the operator's end, and what on the robot.
+"""The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
-An operator's home (made by `init`):
+Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none.
+
+An operator's home (made by `init`); it holds no reader's key and no robot's:
 
     server.toml          settings of the server
-    ca/ server/          the CA, and the server's identity; keys encrypted under the operator passphrase
-    readers/NAME/        readers' identities made here; `init` makes `owner`. Each folder is a reader's home (below)
+    ca.crt.pem ca/       the CA's certificate, and its key, unless that is kept in a folder elsewhere
+    server/              the server's identity; its keys, like the CA's, under the operator passphrase
+    readers/NAME.pem     the certificates of those who may read; robots are given them
     accounts.json        the seed of all Ethereum accounts, under the same passphrase
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
-    inbox.sqlite journal.sqlite     the server's store
+    inbox.sqlite         the server's replica of the robots' logs
     bundles/             what `register` writes for robots
 
 A robot's home (made by `join`):
 
     robot.toml           its topics
-    bridge.json          the server, the contract
-    identity/            its keys, under the registration password, and the CA certificate
-    readers/*.pem        who may read what it writes
-    spool.sqlite         records not acknowledged yet
+    bridge.json          the server, and the ledger it writes to; absent until it has its bundle
+    request.json         what it asks the operator to certify, where it made its own keys
+    identity/            its keys, under its own password, its certificates, and the CA's
+    readers/NAME.pem     who may read what it writes
+    spool.sqlite         its replica of its log
     clock                the latest time the server proved (seconds since 1970), for robots without a clock battery
 
-A reader's home (made by `reader`, to be carried anywhere):
+A reader's home (made by `init` or `reader`, to be carried to the machine that reads):
 
-    reader.toml          contract, node, and where the rest is
+    reader.toml          the ledger, the nodes, and where the rest is
     *.key.pem *.crt.pem  its keys, under its own passphrase, its certificates, and the CA's
     public.pem           its two certificates, for robots that shall seal for it
 """
@@ -30,186 +34,21 @@ A reader's home (made by `reader`, to be carried anywhere):
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any, TypeVar
 
-from rosbridge_eth.errors import ChainError, ConfigError
+from rosbridge_eth.chunk import ledger_id
+from rosbridge_eth.errors import BridgeError, ChainError, ConfigError
+from rosbridge_eth.files import write_atomically as write_atomically
 
+ETH = 10**18
+"""One ether, in wei."""
 
-@dataclass(frozen=True, slots=True)
-class Deployment:
-    """A contract on a chain; `block` is the one that holds its creation. Hashes are 0x-hex."""
-
-    chain_id: int
-    genesis: str
-    contract: str
-    code_hash: str
-    block: int
-
-
-@dataclass(frozen=True, slots=True)
-class BridgeEnd:
-    """What a robot knows of the other end. `server_address` is HOST:PORT."""
-
-    robot: str
-    server_name: str
-    server_address: str
-    contract: str
-    chain_id: int
-
-
-def write_atomically(path: Path, content: bytes, *, mode: int = 0o644) -> None:
-    """Write a file so that a crash leaves the old one or the new one, never half of it."""
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(temporary).chmod(mode)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-@dataclass(frozen=True, slots=True)
-class OperatorHome:
-    """Paths of an operator's home; nothing here reads a secret."""
-
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "server.toml"
-
-    @property
-    def ca(self) -> Path:
-        return self.path / "ca"
-
-    @property
-    def server(self) -> Path:
-        return self.path / "server"
-
-    @property
-    def accounts(self) -> Path:
-        return self.path / "accounts.json"
-
-    @property
-    def registry(self) -> Path:
-        return self.path / "registry.sqlite"
-
-    @property
-    def inbox(self) -> Path:
-        return self.path / "inbox.sqlite"
-
-    @property
-    def journal(self) -> Path:
-        return self.path / "journal.sqlite"
-
-    @property
-    def submitter_lock(self) -> Path:
-        return self.path / "submitter.lock"
-
-    @property
-    def bundles(self) -> Path:
-        return self.path / "bundles"
-
-    def reader(self, name: str) -> Path:
-        return self.path / "readers" / name
-
-    def require(self) -> OperatorHome:
-        """This home, if `init` made it; else ConfigError."""
-        if not self.config.exists():
-            raise ConfigError(f"{self.path} is not an operator's home; run `init --home {self.path}` first")
-        return self
-
-    @property
-    def deployment_file(self) -> Path:
-        return self.path / "deployment.json"
-
-    def save_deployment(self, deployment: Deployment) -> None:
-        write_atomically(self.deployment_file, json.dumps(asdict(deployment), indent=1).encode() + b"\n")
-
-    def deployment(self) -> Deployment:
-        try:
-            return Deployment(**json.loads(self.deployment_file.read_bytes()))
-        except FileNotFoundError:
-            raise ChainError(f"no contract is deployed yet; run `deploy --home {self.path}`") from None
-        except (ValueError, TypeError) as error:
-            raise ConfigError(f"{self.deployment_file} is damaged ({error}); run `deploy` again") from error
-
-
-@dataclass(frozen=True, slots=True)
-class RobotHome:
-    """Paths of a robot's home."""
-
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "robot.toml"
-
-    @property
-    def identity(self) -> Path:
-        return self.path / "identity"
-
-    @property
-    def readers(self) -> Path:
-        return self.path / "readers"
-
-    @property
-    def spool(self) -> Path:
-        return self.path / "spool.sqlite"
-
-    @property
-    def clock(self) -> Path:
-        return self.path / "clock"
-
-    @property
-    def bridge_file(self) -> Path:
-        return self.path / "bridge.json"
-
-    def save_bridge(self, end: BridgeEnd) -> None:
-        write_atomically(self.bridge_file, json.dumps(asdict(end), indent=1).encode() + b"\n")
-
-    def bridge(self) -> BridgeEnd:
-        try:
-            return BridgeEnd(**json.loads(self.bridge_file.read_bytes()))
-        except FileNotFoundError:
-            text = f"{self.path} is not a robot's home; run `join BUNDLE --home {self.path}` first"
-            raise ConfigError(text) from None
-        except (ValueError, TypeError) as error:
-            raise ConfigError(f"{self.bridge_file} is damaged ({error}); join again") from error
-
-    def clock_floor(self) -> float:
-        """The latest time (seconds since 1970) a server proved to this robot; 0 where there is none."""
-        try:
-            return float(self.clock.read_text())
-        except (FileNotFoundError, ValueError):
-            return 0.0
-
-    def raise_clock_floor(self, seconds: float) -> None:
-        if seconds > self.clock_floor():
-            write_atomically(self.clock, f"{seconds:.0f}\n".encode())
-
-
-@dataclass(frozen=True, slots=True)
-class ReaderHome:
-    """Paths of a reader's home."""
-
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        return self.path / "reader.toml"
-
-    @property
-    def public(self) -> Path:
-        return self.path / "public.pem"
+_LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
+_FORMAT = "rosbridge-eth home 2"
+_OF_THE_FIRST_EDITION = ("server.toml", "bridge.json", "reader.toml", "journal.sqlite")
 
 
 class HomeKind(StrEnum):
@@ -220,15 +59,193 @@ class HomeKind(StrEnum):
     READER = "reader"
 
 
-def kind_of(path: Path) -> HomeKind:
-    """Whose home this is, by the file that makes it one; ConfigError if it is nobody's."""
-    if OperatorHome(path).config.exists():
-        return HomeKind.OPERATOR
-    if RobotHome(path).bridge_file.exists():
-        return HomeKind.ROBOT
-    if ReaderHome(path).config.exists():
-        return HomeKind.READER
-    raise ConfigError(
-        f"{path} is nobody's home; `init --home` makes an operator's, `join BUNDLE --home` a robot's,"
-        " `reader NAME` a reader's"
+_WHOSE = {HomeKind.OPERATOR: "an operator's", HomeKind.ROBOT: "a robot's", HomeKind.READER: "a reader's"}
+
+
+def ledger_of(chain_id: int, genesis: str, contract: str) -> bytes:
+    """chunk.ledger_id of a hash and an address in 0x-hex."""
+    return ledger_id(chain_id, bytes.fromhex(genesis.removeprefix("0x")), bytes.fromhex(contract.removeprefix("0x")))
+
+
+@dataclass(frozen=True, slots=True)
+class Deployment:
+    """A contract on a chain; `block` is the one that holds its creation. Hashes and address are 0x-hex."""
+
+    chain_id: int
+    genesis: str
+    contract: str
+    block: int
+    code_hash: str
+
+    @property
+    def ledger(self) -> bytes:
+        """What every signature of a log covers, 32 bytes (chunk.ledger_id)."""
+        return ledger_of(self.chain_id, self.genesis, self.contract)
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeEnd:
+    """What a robot knows of the other end. `server_address` is HOST:PORT; the ledger as in Deployment."""
+
+    robot: str
+    server_name: str
+    server_address: str
+    chain_id: int
+    genesis: str
+    contract: str
+
+    @property
+    def ledger(self) -> bytes:
+        """As Deployment.ledger."""
+        return ledger_of(self.chain_id, self.genesis, self.contract)
+
+
+# JSON files
+
+_Document = TypeVar("_Document", Deployment, BridgeEnd)
+
+def _save(path: Path, value: dict[str, Any]) -> None:
+    write_atomically(path, json.dumps(value, indent=1).encode() + b"\n")
+
+
+def _load(path: Path, mend: str, absent: BridgeError) -> dict[str, Any]:
+    """The object in a file. ConfigError with the way out where it is none; `absent` where there is no file."""
+    try:
+        return dict(json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        raise absent from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}); {mend}") from error
+
+
+def _read(form: type[_Document], path: Path, mend: str, absent: BridgeError) -> _Document:
+    try:
+        return form(**_load(path, mend, absent))
+    except TypeError as error:
+        raise ConfigError(f"{path} is damaged ({error}); {mend}") from error
+
+
+def make_home(path: Path, kind: HomeKind, **more: str) -> None:
+    """Make a folder somebody's home, as the last step; `more` is kept with it (`home_of`)."""
+    _save(path / "home.json", {"format": _FORMAT, "kind": str(kind), **more})
+
+
+def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[str, Any]:
+    """What `make_home` wrote. ConfigError where it is nobody's home, of the first edition, or not of this kind."""
+    if not (path / "home.json").exists() and any((path / name).exists() for name in _OF_THE_FIRST_EDITION):
+        raise ConfigError(
+            f"{path} is a home of the first edition, whose records have another format, or lost its home.json;"
+            " make a new home in another folder"
+        )
+    nobodys = ConfigError(
+        f"{path} is nobody's home; `init --home` makes an operator's, `join` a robot's, `reader NAME` a reader's"
+        if kind is None else f"{path} is not {_WHOSE[kind]} home; {mend}"
     )
+    head = _load(path / "home.json", "restore it from your backup", nobodys)
+    if head.get("format") != _FORMAT or head.get("kind") not in HomeKind.__members__.values():
+        raise ConfigError(f"{path} was made by another version of this program; use that one, or make a new home")
+    if kind is not None and head["kind"] != kind:
+        raise ConfigError(f"{path} is {_WHOSE[HomeKind(head['kind'])]} home, not {_WHOSE[kind]}; give another --home")
+    return head
+
+
+def kind_of(path: Path) -> HomeKind:
+    """Whose home this is; ConfigError if it is nobody's."""
+    return HomeKind(home_of(path)["kind"])
+
+
+def require_empty(path: Path) -> None:
+    """ConfigError unless nothing is there yet: a home does not move in with anything else."""
+    if (path / "home.json").exists():
+        raise ConfigError(f"{path} is {_WHOSE[kind_of(path)]} home already; choose another folder")
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise ConfigError(f"{path} is not empty; choose another folder, or remove it")
+
+
+class OperatorHome:
+    """Paths of an operator's home; nothing here reads a secret."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "server.toml"
+        self.ca_certificate = path / "ca.crt.pem"
+        self.server = path / "server"
+        self.readers = path / "readers"
+        self.accounts = path / "accounts.json"
+        self.registry = path / "registry.sqlite"
+        self.deployment_file = path / "deployment.json"
+        self.inbox = path / "inbox.sqlite"
+        self.bundles = path / "bundles"
+        self.submitter_lock = path / "submitter.lock"
+
+    @property
+    def ca(self) -> Path:
+        """The folder of the CA's key and certificate; `init` may have been given another than ours."""
+        return Path(home_of(self.path).get("ca") or self.path / "ca")
+
+    def require(self) -> OperatorHome:
+        """This home, if `init` made it; else ConfigError."""
+        home_of(self.path, HomeKind.OPERATOR, f"run `init --home {self.path}` first")
+        return self
+
+    def save_deployment(self, deployment: Deployment) -> None:
+        _save(self.deployment_file, asdict(deployment))
+
+    def deployment(self) -> Deployment:
+        """ChainError where no contract is deployed yet."""
+        absent = ChainError(f"no contract is deployed yet; run `deploy --home {self.path}`")
+        return _read(Deployment, self.deployment_file, "restore it from your backup", absent)
+
+
+class RobotHome:
+    """Paths of a robot's home."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "robot.toml"
+        self.bridge_file = path / "bridge.json"
+        self.request = path / "request.json"
+        self.identity = path / "identity"
+        self.readers = path / "readers"
+        self.spool = path / "spool.sqlite"
+        self.clock = path / "clock"
+
+    def save_bridge(self, end: BridgeEnd) -> None:
+        _save(self.bridge_file, asdict(end))
+
+    def bridge(self) -> BridgeEnd:
+        """ConfigError where this is no robot's home, or it has not had its bundle yet."""
+        home_of(self.path, HomeKind.ROBOT, f"run `join BUNDLE --home {self.path}` first")
+        absent = ConfigError(
+            f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
+            f" a bundle, and run here `join BUNDLE --home {self.path}`"
+        )
+        return _read(BridgeEnd, self.bridge_file, "join again", absent)
+
+    def clock_floor(self) -> float:
+        """The latest time (seconds since 1970) a server proved to this robot; 0 where there is none."""
+        try:
+            seconds = float(self.clock.read_text())
+        except (FileNotFoundError, ValueError):
+            return 0.0
+        return seconds if 0 <= seconds < _LATEST else 0.0
+
+    def raise_clock_floor(self, seconds: float) -> None:
+        if seconds > self.clock_floor():
+            write_atomically(self.clock, f"{seconds:.0f}\n".encode())
+
+
+class ReaderHome:
+    """Paths of a reader's home."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "reader.toml"
+        self.public = path / "public.pem"
+
+    def require(self) -> ReaderHome:
+        """This home, if it is a reader's; else ConfigError."""
+        home_of(self.path, HomeKind.READER, "`init` makes the owner's and `reader NAME` makes another")
+        return self

@@ -14,44 +14,16 @@ Not here: how certificates travel (channel), what is encrypted to whom (sealing)
 
 from __future__ import annotations
 
-import os
 import re
-import stat
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 
-from rosbridge_eth.errors import IdentityError
-from rosbridge_eth.records import robot_id
+from rosbridge_eth.errors import IdentityError, VerificationError
+from rosbridge_eth.files import read_private, write_atomically
 from smcrypto import CertificateError, InvalidKey, InvalidSignature, SMCryptoError, sm2, x509
-
-__all__ = [
-    "CertificateAuthority",
-    "ExpiredCertificate",
-    "Identity",
-    "NotAllowed",
-    "PeerIdentity",
-    "RevokedCertificate",
-    "Role",
-    "Trust",
-    "UntrustedCertificate",
-    "WrongName",
-    "WrongRole",
-    "check_name",
-    "create_ca",
-    "enrol",
-    "enrol_requests",
-    "identity_files",
-    "identity_from_files",
-    "load_identity",
-    "read_certificates",
-    "requests",
-    "save_identity",
-    "sign",
-    "verify",
-]
 
 SIGNATURE_SIZE = 64
 """Bytes of a signature: r ‖ s, GB/T 32918.2."""
@@ -60,11 +32,15 @@ URI_PREFIX = "urn:rosbridge-eth:"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _PURPOSE = re.compile(r"[a-z][a-z-]*\Z")
 
+_BACKDATED = timedelta(days=1)
+"""Certificates begin so long before they are made, so that a chain or a robot whose clock is behind does no harm."""
+
 # GB/T 38636-2020, 6.4.5.3: a signing certificate signs, an encryption certificate takes keys.
 SIGNING_USAGE = ("digitalSignature",)
 ENCRYPTION_USAGE = ("keyEncipherment", "dataEncipherment", "keyAgreement")
 
-_FILES = ("sign.key.pem", "sign.crt.pem", "enc.key.pem", "enc.crt.pem", "ca.crt.pem")
+KEY_FILES = ("sign.key.pem", "enc.key.pem")
+_FILES = (*KEY_FILES, "sign.crt.pem", "enc.crt.pem", "ca.crt.pem")
 
 
 class Role(StrEnum):
@@ -128,9 +104,14 @@ class PeerIdentity:
     encryption_certificate: x509.Certificate = field(repr=False)
 
     @property
-    def robot_id(self) -> bytes:
-        """Tk of the contract, 32 bytes; see records."""
-        return robot_id(self.name)
+    def certificates(self) -> bytes:
+        """Both in DER, signing first: how they stand in a robot's registration on the chain."""
+        return self.signing_certificate.to_der() + self.encryption_certificate.to_der()
+
+    @property
+    def pem(self) -> bytes:
+        """Both in PEM, signing first: how they stand in files."""
+        return self.signing_certificate.to_pem() + self.encryption_certificate.to_pem()
 
     @property
     def not_before(self) -> datetime:
@@ -312,8 +293,34 @@ def create_ca(
     """A new CA whose certificate says CN=`name`; it can issue to identities only, not to other CAs."""
     key = key or sm2.PrivateKey.generate()
     certificate = x509.self_signed(
-        key, subject={"CN": name}, not_before=at, not_after=at + valid_for, ca=True, path_length=0
+        key, subject={"CN": name}, not_before=at - _BACKDATED, not_after=at + valid_for, ca=True, path_length=0
     )
+    return CertificateAuthority(key, certificate)
+
+
+def load_ca(folder: Path, password: bytes, at: datetime) -> CertificateAuthority:
+    """The CA in a folder, as `create_ca` or `python -m smcrypto ca init` made it: `ca.key.pem` and `ca.crt.pem`.
+
+    IdentityError where the key does not open, is another's, or the certificate is no CA's or not valid at `at`.
+    """
+    key_file, certificate_file = folder / "ca.key.pem", folder / "ca.crt.pem"
+    try:
+        certificate = read_certificates(certificate_file.read_bytes())[0]
+    except OSError as error:
+        raise IdentityError(f"{certificate_file} cannot be read: {error.strerror}") from error
+    try:
+        key = sm2.PrivateKey.from_pem(read_private(key_file), password=password)
+    except InvalidKey as error:
+        raise IdentityError(f"{key_file} does not open under this passphrase") from error
+    if key.public_key != certificate.public_key:
+        raise IdentityError(f"{key_file} is not the key of {certificate_file}")
+    usage = certificate.key_usage
+    if not certificate.is_ca or (usage is not None and "keyCertSign" not in usage):
+        raise IdentityError(f"{certificate_file} is not a CA's certificate: it may not issue others")
+    if not certificate.not_before <= at <= certificate.not_after:
+        raise IdentityError(
+            f"{certificate_file} is valid from {certificate.not_before} to {certificate.not_after}, not at {at}"
+        )
     return CertificateAuthority(key, certificate)
 
 
@@ -338,7 +345,7 @@ def enrol_requests(
     at: datetime,
     valid_for: timedelta = timedelta(days=825),
 ) -> PeerIdentity:
-    """Certificates for `role` and `name` over the keys of two requests.
+    """Certificates for `role` and `name` over the keys of two requests; they begin a day before `at`.
 
     Role, name, uses and validity are the CA's to say; of a request only the
     key and the subject are taken, and the subject must be CN=`name`.
@@ -356,7 +363,7 @@ def enrol_requests(
                 request,
                 ca.certificate,
                 ca.key,
-                not_before=at,
+                not_before=max(at - _BACKDATED, ca.certificate.not_before),
                 not_after=min(at + valid_for, ca.certificate.not_after),
                 key_usage=usage,
                 extended_key_usage=(_extended_key_usage(Role(role)),),
@@ -378,7 +385,7 @@ def enrol(
     signing_key: sm2.PrivateKey | None = None,
     encryption_key: sm2.PrivateKey | None = None,
 ) -> Identity:
-    """A new identity with two fresh keys (or the given ones) and certificates valid from `at`."""
+    """A new identity with two fresh keys (or the given ones) and their certificates."""
     signing_key = signing_key or sm2.PrivateKey.generate()
     encryption_key = encryption_key or sm2.PrivateKey.generate()
     signing_request, encryption_request = requests(name, signing_key, encryption_key)
@@ -408,15 +415,35 @@ def identity_files(
 
 def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
     """Every certificate of a PEM file, in order; IdentityError if there is none or one is malformed."""
-    end = b"-----END CERTIFICATE-----"
-    blocks = pem.split(end)
     try:
-        found = tuple(x509.Certificate.from_pem(block + end + b"\n") for block in blocks[:-1])
+        return x509.load_pem_certificates(pem)
     except SMCryptoError as error:
         raise IdentityError(f"a certificate cannot be read: {error}") from error
-    if not found:
-        raise IdentityError("no certificate was found in the file")
-    return found
+
+
+def public_identity(pem: bytes) -> PeerIdentity:
+    """Whom a PEM file of two certificates, signing first, names; nothing of it is checked (`Trust.check`)."""
+    found = read_certificates(pem)
+    if len(found) != 2:
+        raise IdentityError(f"a file holds {len(found)} certificates; an identity has two, signing and encryption")
+    if _holder(found[0]) != _holder(found[1]):
+        raise IdentityError("the signing and the encryption certificate are of two identities")
+    return PeerIdentity(*_holder(found[0]), *found)
+
+
+def split_certificates(certificates: bytes) -> tuple[bytes, bytes]:
+    """The two (DER) of `PeerIdentity.certificates`; VerificationError if it is not two DER values and nothing else."""
+    parts, rest = list[bytes](), certificates
+    while rest and len(parts) < 2:
+        # SEQUENCE with a two-byte length (X.690, 8.1.3.5): every certificate has between 256 and 65,535 bytes.
+        size = 4 + int.from_bytes(rest[2:4], "big")
+        if rest[:2] != b"\x30\x82" or size > len(rest):
+            break
+        parts.append(rest[:size])
+        rest = rest[size:]
+    if len(parts) != 2 or rest:
+        raise VerificationError("a registration does not hold two certificates")
+    return parts[0], parts[1]
 
 
 def identity_from_files(
@@ -427,7 +454,7 @@ def identity_from_files(
     if missing:
         raise IdentityError(f"the identity is not complete: {', '.join(missing)} missing")
     keys: list[sm2.PrivateKey] = []
-    for name in ("sign.key.pem", "enc.key.pem"):
+    for name in KEY_FILES:
         try:
             keys.append(sm2.PrivateKey.from_pem(files[name], password))
         except SMCryptoError as error:
@@ -449,13 +476,10 @@ def save_identity(
     """Write `identity_files` into `folder` (made 0700 if absent), key files 0600; nothing is overwritten."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in identity_files(identity, roots, password).items():
-        mode = 0o600 if name.endswith(".key.pem") else 0o644
         try:
-            handle = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+            write_atomically(folder / name, content, mode=0o600 if name in KEY_FILES else 0o644, new=True)
         except FileExistsError:
             raise IdentityError(f"{folder / name} exists and is not overwritten") from None
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
 
 
 def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
@@ -464,9 +488,7 @@ def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple
     for name in _FILES:
         path = folder / name
         try:
-            if name.endswith(".key.pem") and stat.S_IMODE(path.stat().st_mode) & 0o077:
-                raise IdentityError(f"{path} can be read by others; run: chmod 600 {path}")
-            files[name] = path.read_bytes()
+            files[name] = read_private(path) if name in KEY_FILES else path.read_bytes()
         except OSError as error:
             raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
     return identity_from_files(files, password)

@@ -13,8 +13,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any, Self
 
+from eth_utils.crypto import keccak
+
+from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import IdentityError, StoreError
+from rosbridge_eth.identity import PeerIdentity, Role
 
 OWNER = "owner"
 """The reader that `init` makes."""
@@ -26,6 +31,7 @@ CREATE TABLE IF NOT EXISTS enrolment (
     name          TEXT NOT NULL,
     fingerprint   BLOB NOT NULL UNIQUE,  -- SM3 of the signing certificate, 32 bytes
     certificates  BLOB NOT NULL,         -- signing and encryption certificate, PEM
+    hash          BLOB NOT NULL,         -- keccak256 of both in DER, which the contract has for a robot
     account       TEXT,                  -- the robot's address on the chain
     enrolled_at   TEXT NOT NULL,         -- UTC, ISO 8601
     revoked_at    TEXT                   -- NULL while in force
@@ -36,20 +42,26 @@ CREATE UNIQUE INDEX IF NOT EXISTS in_force ON enrolment (role, name) WHERE revok
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """One identity the operator made: certificates in PEM, signing first; account for robots only."""
+    """One identity the operator certified: certificates in PEM, signing first; account for robots only."""
 
     number: int
     role: str
     name: str
     fingerprint: bytes
     certificates: bytes
+    hash: bytes
     account: str | None
     enrolled_at: datetime
     revoked_at: datetime | None
 
+    @property
+    def tk(self) -> bytes:
+        """The robot's identity on the chain, 32 bytes."""
+        return robot_id(self.name)
+
 
 class Registry:
-    """The enrolments of one operator's home; safe to open from several processes.
+    """The enrolments of one operator's home; safe to open from several processes, and a context manager.
 
     new: make it, for a home that begins. Otherwise StoreError where it is missing, or lacks the identities that every
     home begins with: it was lost, and taken for a new one it would refuse every robot.
@@ -99,6 +111,12 @@ class Registry:
     def close(self) -> None:
         self._db.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         self._db.execute("BEGIN IMMEDIATE")
@@ -135,59 +153,83 @@ class Registry:
             )
 
     def enrol(
-        self, *, number: int, role: str, name: str, fingerprint: bytes, certificates: bytes,
-        account: str | None, now: datetime, replace: bool = False,
+        self, peer: PeerIdentity, now: datetime, *, number: int | None = None, account: str | None = None,
+        replace: bool = False,
     ) -> Enrolment:
-        """Put an identity in force; with `replace` the one that held the name is revoked in the same write."""
+        """Put an identity in force; with `replace` the one that held the name is revoked in the same write.
+
+        number: of the account, for a robot; otherwise the next one.
+        """
         with self._transaction():
             if replace:
-                self._revoke(role, name, now)
+                self._revoke(peer.role, peer.name, now)
             else:
-                self.require_free(role, name)
+                self.require_free(peer.role, peer.name)
             self._db.execute(
-                "INSERT INTO enrolment VALUES (?, ?, ?, ?, ?, ?, ?, NULL)",
-                (number, role, name, fingerprint, certificates, account, now.isoformat()),
+                "INSERT INTO enrolment VALUES (?, ?, ?, ?, ?, ?, ?, ?, NULL)",
+                (
+                    self.next_number() if number is None else number, str(peer.role), peer.name,
+                    peer.signing_certificate.fingerprint(), peer.pem, keccak(peer.certificates), account,
+                    now.isoformat(),
+                ),
             )
-        found = self.find(role, name)
+        found = self.find(peer.role, peer.name)
         if found is None:
-            raise StoreError(f"the registry lost {role} {name!r} as it was written; check the disk")
+            raise StoreError(f"the registry lost {peer} as it was written; check the disk")
         return found
 
     def _revoke(self, role: str, name: str, now: datetime) -> int:
         return self._db.execute(
             "UPDATE enrolment SET revoked_at = ? WHERE role = ? AND name = ? AND revoked_at IS NULL",
-            (now.isoformat(), role, name),
+            (now.isoformat(), str(role), name),
         ).rowcount
 
-    def revoke(self, role: str, name: str, now: datetime) -> None:
-        """Take a name out of force; IdentityError where it is not in force."""
-        if self._revoke(role, name, now) == 0:
-            raise IdentityError(f"no {role} {name!r} is enrolled; `status` lists the names")
+    def revoke(self, role: str, name: str, now: datetime) -> bool:
+        """Take a name out of force; whether it was in force."""
+        return self._revoke(role, name, now) > 0
 
     def find(self, role: str, name: str) -> Enrolment | None:
         """The enrolment in force under this name."""
         rows = self._db.execute(
-            "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (role, name)
+            "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (str(role), name)
         ).fetchall()
         return _enrolment(rows[0]) if rows else None
 
     def all(self, role: str | None = None) -> list[Enrolment]:
         """Every enrolment there ever was, in order."""
         rows = self._db.execute(
-            "SELECT * FROM enrolment WHERE ?1 IS NULL OR role = ?1 ORDER BY number", (role,)
+            "SELECT * FROM enrolment WHERE ?1 IS NULL OR role = ?1 ORDER BY number", (role and str(role),)
         ).fetchall()
         return [_enrolment(row) for row in rows]
 
-    def allows(self, role: str, name: str, fingerprint: bytes) -> bool:
+    def readers(self) -> list[Enrolment]:
+        """The readers in force."""
+        return [reader for reader in self.all(Role.READER) if reader.revoked_at is None]
+
+    def robots(self) -> dict[bytes, Enrolment]:
+        """Every robot there ever was: Tk to its newest enrolment, in force or not."""
+        return {robot.tk: robot for robot in self.all(Role.ROBOT)}
+
+    def names(self) -> dict[bytes, str]:
+        """Every robot there ever was: Tk to its name."""
+        return {tk: robot.name for tk, robot in self.robots().items()}
+
+    def allows(self, peer: PeerIdentity) -> bool:
         """Is this very certificate the one in force for the name?"""
-        found = self.find(role, name)
-        return found is not None and found.fingerprint == fingerprint
+        found = self.find(peer.role, peer.name)
+        return found is not None and found.fingerprint == peer.signing_certificate.fingerprint()
+
+    def certificates_hash(self, name: str) -> bytes | None:
+        """keccak256 of the certificates in force for a robot, as its registration has them; None without any."""
+        found = self.find(Role.ROBOT, name)
+        return None if found is None else found.hash
 
 
-def _enrolment(row: tuple[int, str, str, bytes, bytes, str | None, str, str | None]) -> Enrolment:
-    number, role, name, fingerprint, certificates, account, enrolled_at, revoked_at = row
-    return Enrolment(
-        number, role, name, fingerprint, certificates, account,
-        datetime.fromisoformat(enrolled_at).astimezone(UTC),
-        None if revoked_at is None else datetime.fromisoformat(revoked_at).astimezone(UTC),
-    )
+def _enrolment(row: tuple[Any, ...]) -> Enrolment:
+    *known, enrolled_at, revoked_at = row
+    times = (_moment(enrolled_at), None if revoked_at is None else _moment(revoked_at))
+    return Enrolment(*(*known, *times))
+
+
+def _moment(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import stat
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,8 +17,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from rosbridge_eth.config.models import SOURCE_KINDS, ReaderConfig, RobotConfig, Section, ServerConfig
-from rosbridge_eth.config.values import SIZE, duration_text, size_text
-from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.errors import ConfigError
 
 _Config = TypeVar("_Config", bound=Section)
 MAX_FILE = 1 << 20
@@ -50,33 +48,10 @@ def parse_config(model: type[_Config], text: str, file: Path) -> _Config:
     try:
         return model.model_validate(values, context={"folder": file.parent})
     except ValidationError as error:
-        problems = [_problem(model, detail, text, values) for detail in error.errors(include_url=False)]
+        problems = [_problem(model, detail, text) for detail in error.errors(include_url=False)]
         shown = "; ".join(problems[:MAX_PROBLEMS])
         more = f"; and {len(problems) - MAX_PROBLEMS} more" if len(problems) > MAX_PROBLEMS else ""
         raise ConfigError(f"{file}: {shown}{more}") from None
-
-
-def require_file(path: Path, what: str) -> Path:
-    """`path` if it is a file; else ConfigError. `what`: "CA certificate" or the like."""
-    if not path.is_file():
-        raise ConfigError(f"{what} {path} " + ("is a folder; name a file" if path.is_dir() else "does not exist"))
-    return path
-
-
-def require_private(path: Path) -> Path:
-    """`path` if nobody but its owner can read or write it; else IdentityError."""
-    try:
-        mode = stat.S_IMODE(path.stat().st_mode)
-    except FileNotFoundError:
-        raise IdentityError(f"key file {path} does not exist") from None
-    except OSError as error:
-        raise IdentityError(f"key file {path} cannot be read: {error.strerror}") from error
-    if mode & 0o077:
-        raise IdentityError(
-            f"key file {path} is open to others (mode {mode:04o}); run `chmod 600 {path}`, "
-            "and if it may have been read, register anew"
-        )
-    return path
 
 
 def _read(path: Path, example: str) -> str:
@@ -100,35 +75,40 @@ def _read(path: Path, example: str) -> str:
 _EXPECTED = {
     "string_type": "a string in quotes",
     "int_type": "a whole number",
+    "int_from_float": "a whole number",
     "float_type": "a number",
+    "finite_number": "a finite number",
     "bool_type": "true or false",
     "list_type": "a list in [ ]",
     "dict_type": "a table",
     "model_type": "a table",
     "model_attributes_type": "a table",
-    "int_from_float": "a whole number",
-    "finite_number": "a finite number",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "less than {lt}",
+    "less_than_equal": "at most {le}",
 }
-_BOUNDS = {
-    "greater_than": ("gt", "more than"),
-    "greater_than_equal": ("ge", "at least"),
-    "less_than": ("lt", "less than"),
-    "less_than_equal": ("le", "at most"),
+REMOVED = {
+    "delivery": "every record is kept in the log; `rate` makes fewer of them",
+    "acknowledge": "every chunk is kept until it is confirmed on the chain",
+    "stream": "a new stream begins at every start, and each chunk has a key of its own; [log] has its period",
+    "commit": "[log] period says what a power cut costs",
+    "max_records": "max_size bounds it",
+    "batch": "the submitter fills transactions by itself; a robot's [log] period makes chunks larger",
+    "poll": "the node is asked once a block",
+    "bump_after": "what stands still for 30 s is sent again at a higher price, up to max_fee_gwei",
+    "keep": "confirmed chunks stay a day",
+    "remember": "a stream's last number is remembered for good",
 }
+"""Keys of the first edition, and what does their work now."""
 
 
-def _problem(model: type[Section], detail: ErrorDetails, text: str, values: Mapping[str, Any]) -> str:
+def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
     location = _without_tags(detail["loc"])
     key = _key(location)
     kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "extra_forbidden":
-        name = str(location[-1])
-        table = _key(location[:-1])
-        allowed = _allowed_keys(model, location[:-1])
-        near = difflib.get_close_matches(name, allowed, 1)
-        hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(allowed)}"
-        where = f" in {table}" if table else ""
-        sentence = f"unknown key {name!r}{where}; {hint}"
+        sentence = _unknown(model, location)
     elif kind == "missing":
         sentence = f"{key} is missing"
     elif kind == "literal_error":
@@ -137,14 +117,9 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str, values: Mapp
         hint = f"; did you mean {near[0]}?" if near else ""
         sentence = f"{key} is {_shown(given)}; allowed: {', '.join(allowed)}{hint}"
     elif kind in _EXPECTED:
-        expected = _EXPECTED[kind]
-        if len(location) == 2 and location[0] == "topics":
-            expected = "a name in quotes, or a table"
+        topic = len(location) == 2 and location[0] == "topics"
+        expected = "a name in quotes, or a table" if topic else _EXPECTED[kind].format(**context)
         sentence = f"{key} is {_shown(given)}; it should be {expected}"
-    elif kind in _BOUNDS:
-        name, words = _BOUNDS[kind]
-        given, bound = _as_written(values, location, given, context[name])
-        sentence = f"{key} is {_shown(given)}; it should be {words} {bound}"
     elif kind == "too_short":
         sentence = f"{key} is empty"
     elif kind == "value_error":
@@ -157,19 +132,15 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str, values: Mapp
     return f"line {line}: {sentence}" if line and location else sentence
 
 
-def _as_written(values: Mapping[str, Any], location: Sequence[str | int], given: Any, bound: Any) -> tuple[Any, str]:
-    """A value and its bound as the file has them: a bound on a duration or a size gets its unit."""
-    written: Any = values
-    for part in location:
-        try:
-            written = written[part]
-        except (KeyError, IndexError, TypeError):
-            return given, str(bound)
-    if not isinstance(written, str):
-        return given, str(bound)
-    if SIZE.fullmatch(written):
-        return written, repr(size_text(bound))
-    return written, repr(duration_text(bound if isinstance(given, float) else bound / 1e9))
+def _unknown(model: type[Section], location: Sequence[str | int]) -> str:
+    name, table = str(location[-1]), _key(location[:-1])
+    allowed = _allowed_keys(model, location[:-1])
+    near = difflib.get_close_matches(name, allowed, 1)
+    if name in REMOVED:
+        hint = f"it is gone since the second edition: {REMOVED[name]}"
+    else:
+        hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(allowed)}"
+    return f"unknown key {name!r}{f' in {table}' if table else ''}; {hint}"
 
 
 def _without_tags(location: Sequence[str | int]) -> tuple[str | int, ...]:
@@ -192,13 +163,8 @@ def _allowed_keys(model: type[Section], location: Sequence[str | int]) -> list[s
     tables: list[type[BaseModel]] = [model]
     for part in location:
         if isinstance(part, str):
-            annotations = [
-                field.annotation
-                for table in tables
-                for name, field in table.model_fields.items()
-                if part in (field.alias, name)
-            ]
-            tables = [table for annotation in annotations for table in _models_in(annotation)]
+            tables = [below for table in tables if part in table.model_fields
+                      for below in _models_in(table.model_fields[part].annotation)]
     return sorted({field.alias or name for table in tables for name, field in table.model_fields.items()})
 
 
@@ -225,10 +191,8 @@ def _line(text: str, location: Sequence[str | int]) -> int | None:
             keys = tuple(part.strip() for part in setting[1].split("."))
             for end in range(1, len(keys) + 1):
                 lines.setdefault((*table, *keys[:end]), number)
-    for end in range(len(location), 0, -1):
-        if tuple(location[:end]) in lines:
-            return lines[tuple(location[:end])]
-    return None
+    return next((lines[tuple(location[:end])] for end in range(len(location), 0, -1)
+                 if tuple(location[:end]) in lines), None)
 
 
 def _shown(value: Any) -> str:

@@ -1,6 +1,7 @@
-"""What can be configured, key by key. The descriptions are the reference's text (docs/configuration.md).
+"""What can be configured, key by key. The docstrings are the reference's text (docs/configuration.md): what a
+table is for, then one paragraph for each key.
 
-A robot's whole configuration may be `topics = ["/robot_1/odom"]`.
+A robot's whole configuration may be `topics = ["/robot_1/odom"]`, where the environment says which ROS is there.
 """
 
 from __future__ import annotations
@@ -9,32 +10,50 @@ import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, WithJsonSchema
+from pydantic import model_validator as validator
 
 from rosbridge_eth.capture import NamePattern, TopicRule
 from rosbridge_eth.capture.paths import parse_paths
-from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, Seconds, Size, TimeNs
-from rosbridge_eth.errors import ConfigError, SourceError
-from rosbridge_eth.sources import BagSettings, Selection, SimSettings
-from rosbridge_eth.sources.ros1 import Ros1Settings
-from rosbridge_eth.sources.ros1.addressing import MASTER_PORT, is_graph_name, is_host, read_uri
-from rosbridge_eth.sources.ros2 import Ros2Settings
+from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
+from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.home import ledger_of
+
+if TYPE_CHECKING:
+    from rosbridge_eth.sources import Selection
+    from rosbridge_eth.sources.kinds import SourceSettings
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
-SECOND_NS = 10**9
 
 
 class Section(BaseModel):
     """A table of the file: unknown keys are refused, nothing is converted behind one's back."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, validate_by_name=True, validate_by_alias=True
+    )
+
+
+def _matching(pattern: str, words: str, *, secret: bool = False) -> AfterValidator:
+    """A string of this form. secret: a value that does not fit is not shown, since a URL often carries a key."""
+
+    def check(value: str) -> str:
+        if not re.fullmatch(pattern, value, re.ASCII):
+            raise ValueError(f"is not {words}" if secret else f"is {value!r}; {words}")
+        return value
+
+    return AfterValidator(check)
 
 
 def _pattern(value: str) -> str:
     return NamePattern(value).text
+
+
+def _field_path(value: str) -> str:
+    parse_paths([value])
+    return value
 
 
 def _speed(value: Any) -> float | None:
@@ -49,103 +68,79 @@ def _table_of_name(value: Any) -> Any:
     return {"topic": value} if isinstance(value, str) else value
 
 
-def _field_path(value: str) -> str:
-    parse_paths([value])
-    return value
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
 
 
-def _name(value: str) -> str:
-    if not re.fullmatch(r"[a-z0-9][a-z0-9_.\-]{0,62}", value, re.ASCII):
-        raise ValueError(f"is {value!r}; a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")
-    return value
-
-
-def _topic_part(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", value, re.ASCII):
-        raise ValueError(f"is {value!r}; it becomes part of a topic's name: letters, digits and _")
-    return value
-
-
-def _ros_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z_](?:_?[A-Za-z0-9])*_?", value, re.ASCII) or len(value) > 255:
-        raise ValueError(f"is {value!r}; a node's name has letters, digits and single _, and no digit in front")
-    return value
-
-
-def _contract(value: str) -> str:
-    if not re.fullmatch(r"0x[0-9a-fA-F]{40}", value, re.ASCII):
-        raise ValueError(f"is {value!r}; an address is 0x and 40 hexadecimal digits")
-    return value
-
-
-def _master(value: str) -> str:
-    try:
-        read_uri(value, MASTER_PORT)
-    except SourceError:
-        raise ValueError(f'is {value!r}; write the master\'s URI, such as "http://192.0.2.7:11311"') from None
-    return value
-
-
-def _host(value: str) -> str:
-    if not is_host(value):
-        raise ValueError(f"is {value!r}; write a name or an address, without a port")
-    return value
-
-
-def _node(value: str) -> str:
-    name = value if value.startswith("/") else f"/{value}"
-    if not is_graph_name(name):
-        raise ValueError(f'is {value!r}; a node\'s name has letters, digits, _ and /, such as "/robot_1/recorder"')
-    return name
-
-
+_HOST = r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]+)"
+_PART = "[A-Za-z][A-Za-z0-9_]*"
 Pattern: TypeAlias = Annotated[str, AfterValidator(_pattern)]
-Speed: TypeAlias = Annotated[float | None, BeforeValidator(_speed)]
 FieldPath: TypeAlias = Annotated[str, AfterValidator(_field_path)]
-Name: TypeAlias = Annotated[str, AfterValidator(_name)]
+Speed: TypeAlias = Annotated[float | None, BeforeValidator(_speed), WithJsonSchema({"type": 'number or `"max"`'})]
 Mode: TypeAlias = Literal["exchange", "transport"]
+Name: TypeAlias = Annotated[str, _matching(
+    r"[a-z0-9][a-z0-9_.\-]{0,62}", "a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")]
+MasterUri: TypeAlias = Annotated[str, _matching(
+    rf"http://{_HOST}(?::\d{{1,5}})?/?", 'write the master\'s URI, such as "http://192.0.2.7:11311"')]
+Host: TypeAlias = Annotated[str, _matching(
+    r"[A-Za-z0-9_.\-]+|[0-9A-Fa-f:.]+", "write a name or an address, without a port")]
+Ros1Node: TypeAlias = Annotated[str, _matching(
+    rf"/?{_PART}(?:/{_PART})*", 'a node\'s name has letters, digits, _ and /, such as "/robot_1/recorder"')]
+Ros2Node: TypeAlias = Annotated[str, _matching(
+    r"(?=.{1,255}\Z)[A-Za-z_](?:_?[A-Za-z0-9])*_?",
+    "a node's name has letters, digits and single _, and no digit in front")]
+TopicPart: TypeAlias = Annotated[str, _matching(
+    r"[A-Za-z][A-Za-z0-9_]{0,62}", "it becomes part of a topic's name: letters, digits and _")]
+NodeUrl: TypeAlias = Annotated[str, _matching(
+    rf"https?://(?:[^\s@/]+@)?{_HOST}(?::\d{{1,5}})?(?:[/?]\S*)?",
+    'a node\'s URL; write "http://127.0.0.1:8545" or "https://..."', secret=True)]
+StoreUrl: TypeAlias = Annotated[str, _matching(
+    r"sqlite|rediss?://\S+|unix://\S+", 'a store; write "sqlite" or "redis://127.0.0.1:6379/0"', secret=True)]
+ContractAddress: TypeAlias = Annotated[str, _matching(
+    "0x[0-9a-fA-F]{40}", "an address is 0x and 40 hexadecimal digits")]
+Hash: TypeAlias = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexadecimal digits")]
 
 
 # The robot
 
 
 class TopicConfig(Section):
-    """A topic, or a pattern of topics, with how it is captured. A plain string is the same with nothing else set."""
+    """A topic, or a pattern of topics, with how it is captured. A plain string is the same with nothing else set.
 
-    topic: Pattern = Field(
-        description="Name, or pattern: `*` and `?` within one part of the name, `**` across parts, `[ab]`."
-    )
-    fields: list[FieldPath] = Field(
-        default=[],
-        description='What is captured: `"pose.pose.position.x"`, `"ranges[0]"`, `"poses[*].position"`, `"*"` for all. '
-        "Without it, all of the message; of Odometry, the pose and twist without their covariances.",
-    )
-    rate: float | None = Field(default=None, gt=0, le=10_000, description="Records per second, at most.")
-    at: TimeNs | None = Field(default=None, description="A moment: only the first message at that time or after it.")
-    once: bool = Field(default=False, description="Only the first message (of the period, if there is one).")
-    from_: TimeNs | None = Field(default=None, alias="from", description="A period: only messages from then on.")
-    until: TimeNs | None = Field(default=None, description="A period: only messages before then.")
-    for_: DurationNs | None = Field(
-        default=None, alias="for", description="Length of the period, from `from` or from the first message."
-    )
-    delivery: Literal["reliable", "latest"] | None = Field(
-        default=None,
-        description="`reliable`: every record arrives. `latest`: a newer one may take the place of one that waits. "
-        "Without it, that of `[capture]`.",
-    )
-    oversize: Literal["digest", "refuse"] | None = Field(
-        default=None, description="As in `[capture]`, for this topic alone."
-    )
+    topic: Name, or pattern: `*` and `?` within one part of the name, `**` across parts, `[ab]`.
 
-    @model_validator(mode="after")
+    fields: What is captured: `"pose.pose.position.x"`, `"ranges[0]"`, `"poses[*].position"`, `"*"` for all. Without
+    it, all of the message.
+
+    rate: Records per second, at most.
+
+    at: A moment: only the first message at that time or after it.
+
+    once: Only the first message (of the period, if there is one).
+
+    from: A period: only messages from then on.
+
+    until: A period: only messages before then.
+
+    for: Length of the period, from `from` or from the first message.
+    """
+
+    topic: Pattern
+    fields: list[FieldPath] = []
+    rate: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    at: TimeNs | None = None
+    once: bool = False
+    from_: TimeNs | None = Field(default=None, alias="from")
+    until: TimeNs | None = None
+    for_: DurationNs | None = Field(default=None, alias="for")
+
+    @validator(mode="after")
     def _consistent(self) -> TopicConfig:
         parse_paths(self.fields)
-        period = [
-            key for key, value in (("from", self.from_), ("until", self.until), ("for", self.for_)) if value is not None
-        ]
-        if self.at is not None and (period or self.once or self.rate is not None):
-            also = ", ".join([*period, *(["once"] if self.once else []), *(["rate"] if self.rate else [])])
-            raise ValueError(f"has both `at` and {also}; a moment is one message, choose one")
+        given = {"from": self.from_, "until": self.until, "for": self.for_, "once": self.once or None,
+                 "rate": self.rate}
+        if self.at is not None and (also := [key for key, value in given.items() if value is not None]):
+            raise ValueError(f"has both `at` and {', '.join(also)}; a moment is one message, choose one")
         if self.until is not None and self.for_ is not None:
             raise ValueError("has both `until` and `for`; choose one")
         if self.from_ is not None and self.until is not None and self.until <= self.from_:
@@ -154,143 +149,163 @@ class TopicConfig(Section):
 
 
 class CaptureConfig(Section):
-    """What holds for every topic that does not say otherwise."""
+    """What holds for every topic.
 
-    delivery: Literal["reliable", "latest"] = Field(default="reliable", description="See `topics`.")
-    oversize: Literal["digest", "refuse"] = Field(
-        default="digest",
-        description="What becomes of a field above `field_limit`: its SM3 digest and length are captured instead, "
-        "or the message is left out. Both are counted, and said once per topic.",
-    )
-    field_limit: Size = Field(default=KIB, le=16 * KIB, description="Largest field that is captured as it is.")
+    oversize: What becomes of a field above `field_limit`: its SM3 digest and length are captured instead, or the
+    message is left out, which the log says. Both are counted, and said once per topic.
+
+    field_limit: Largest field that is captured as it is.
+    """
+
+    oversize: Literal["digest", "refuse"] = "digest"
+    field_limit: Annotated[int, size(high="48 KiB")] = 16 * KIB
 
 
 class BagConfig(Section):
-    """Replay a bag: ROS 1 `.bag`, ROS 2 folder, `.db3` or `.mcap`."""
+    """Replay a bag: ROS 1 `.bag`, ROS 2 folder, `.db3` or `.mcap`.
 
-    kind: Literal["bag"] = Field(description="`bag`")
-    path: FilePath = Field(description="The bag. A relative path starts at the folder of this file.")
-    speed: Speed = Field(
-        default=1.0, description='Factor on the recorded pace, or `"max"`: as fast as records are taken.'
-    )
-    start: DurationNs | None = Field(default=None, description="Skip so much of the recording.")
-    stop: DurationNs | None = Field(default=None, description="End so long after the beginning of the recording.")
+    kind: `bag`
 
-    @model_validator(mode="after")
+    path: The bag. A relative path starts at the folder of this file.
+
+    speed: Factor on the recorded pace, or `"max"`: as fast as records are taken.
+
+    start: Skip so much of the recording.
+
+    stop: End so long after the beginning of the recording.
+    """
+
+    kind: Literal["bag"]
+    path: FilePath
+    speed: Speed = 1.0
+    start: DurationNs | None = None
+    stop: DurationNs | None = None
+
+    @validator(mode="after")
     def _consistent(self) -> BagConfig:
         if self.start is not None and self.stop is not None and self.stop <= self.start:
             raise ValueError("ends before it begins: `stop` is not after `start`")
         return self
 
-    def settings(self) -> BagSettings:
+    def settings(self) -> SourceSettings:
         """For sources.open_source."""
+        from rosbridge_eth.sources import BagSettings
+
         return BagSettings(self.path, self.speed, self.start or 0, self.stop)
 
 
 class Ros1Config(Section):
-    """A live ROS 1 master, with no ROS installed here (docs/howto-ros1.md)."""
+    """A live ROS 1 master, with no ROS installed here (docs/howto-ros1.md).
 
-    kind: Literal["ros1"] = Field(description="`ros1`")
-    master: Annotated[str, AfterValidator(_master)] | None = Field(
-        default=None,
-        description="The master's URI; without it, that of `ROS_MASTER_URI`, otherwise `http://localhost:11311`.",
-    )
-    hostname: Annotated[str, AfterValidator(_host)] | None = Field(
-        default=None,
-        description="Name or address under which the master reaches this machine; without it, `ROS_HOSTNAME`, "
-        "`ROS_IP`, or the address that this machine uses towards the master.",
-    )
-    node: Annotated[str, AfterValidator(_node)] | None = Field(
-        default=None,
-        description="The name under which the robot appears in the graph; without it, one of its own for each "
-        "process, `/rosbridge_eth_MACHINE_PID`.",
-    )
-    max_message: Size = Field(
-        default=32 * MIB,
-        ge=KIB,
-        le=64 * MIB,
-        description="A larger message is not read, but counted. Messages that wait or are arriving take at most "
-        "four times as much memory.",
-    )
-    waiting: int = Field(
-        default=4096,
-        ge=16,
-        le=1_000_000,
-        description="Messages that wait to be captured, at most; the topic that has most of them then loses its "
-        "oldest, which is counted. Publishers are never made to wait.",
-    )
-    timeout: Seconds = Field(
-        default=5.0, ge=0.1, le=60, description="For a call to the master or a publisher, and for a publisher's header."
-    )
+    kind: `ros1`
 
-    def settings(self) -> Ros1Settings:
+    master: The master's URI; without it, that of `ROS_MASTER_URI`, otherwise `http://localhost:11311`.
+
+    hostname: Name or address under which the master reaches this machine; without it, `ROS_HOSTNAME`, `ROS_IP`, or the
+    address that this machine uses towards the master.
+
+    node: The name under which the robot appears in the graph; without it, one of its own for each process,
+    `/rosbridge_eth_MACHINE_PID`.
+
+    max_message: A larger message is not read, but counted. Messages that wait or are arriving take at most four times
+    as much memory.
+    """
+
+    kind: Literal["ros1"]
+    master: MasterUri | None = None
+    hostname: Host | None = None
+    node: Ros1Node | None = None
+    max_message: Annotated[int, size("1 KiB", "64 MiB")] = 32 * MIB
+
+    def settings(self) -> SourceSettings:
         """For sources.open_source."""
-        return Ros1Settings(self.master, self.hostname, self.node, self.max_message, self.waiting, self.timeout)
+        from rosbridge_eth.sources.ros1 import Ros1Settings
+
+        return Ros1Settings(self.master, self.hostname, self.node, self.max_message)
 
 
 class Ros2Config(Section):
-    """The live ROS 2 graph, through the rclpy of the Python that runs the robot."""
+    """The live ROS 2 graph, through the rclpy of the Python that runs the robot.
 
-    kind: Literal["ros2"] = Field(description="`ros2`")
-    domain: int | None = Field(
-        default=None, ge=0, le=232, description="The graph's domain; without it, that of `ROS_DOMAIN_ID`, or 0."
-    )
-    node: Annotated[str, AfterValidator(_ros_name)] = Field(
-        default="rosbridge_eth", description="The name under which the robot appears in the graph."
-    )
-    depth: int = Field(
-        default=256, ge=1, le=65_536, description="Messages of a topic that the middleware keeps until they are taken."
-    )
+    kind: `ros2`
 
-    def settings(self) -> Ros2Settings:
+    domain: The graph's domain; without it, that of `ROS_DOMAIN_ID`, or 0.
+
+    node: The name under which the robot appears in the graph.
+
+    depth: Messages of a topic that the middleware keeps until they are taken.
+    """
+
+    kind: Literal["ros2"]
+    domain: Annotated[int, Field(ge=0, le=232)] | None = None
+    node: Ros2Node = "rosbridge_eth"
+    depth: int = Field(default=256, ge=1, le=65_536)
+
+    def settings(self) -> SourceSettings:
         """For sources.open_source."""
+        from rosbridge_eth.sources.ros2 import Ros2Settings
+
         return Ros2Settings(self.domain, self.node, self.depth)
 
 
 class SimConfig(Section):
-    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`, so that anything can be tried."""
+    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`, so that anything can be tried. Every record says
+    that it is from a simulation.
 
-    kind: Literal["sim"] = Field(description="`sim`")
-    robot: Annotated[str, AfterValidator(_topic_part)] = Field(default="robot_1", description="The NAME in its topics.")
-    seed: int = Field(default=1, ge=0, lt=2**63, description="The same seed drives the same way.")
-    rate: float = Field(default=10.0, gt=0, le=10_000, description="Odometry and IMU messages per second.")
-    duration: DurationNs | None = Field(default=None, description="End after so long; without it, never.")
-    speed: Speed = Field(default=1.0, description="As of a bag.")
+    kind: `sim`
 
-    def settings(self) -> SimSettings:
+    robot: The NAME in its topics.
+
+    seed: The same seed drives the same way.
+
+    rate: Odometry and IMU messages per second.
+
+    duration: End after so long; without it, never.
+
+    speed: As of a bag.
+    """
+
+    kind: Literal["sim"]
+    robot: TopicPart = "robot_1"
+    seed: int = Field(default=1, ge=0, lt=2**63)
+    rate: float = Field(default=10.0, gt=0, le=10_000)
+    duration: DurationNs | None = None
+    speed: Speed = 1.0
+
+    def settings(self) -> SourceSettings:
         """For sources.open_source."""
+        from rosbridge_eth.sources import SimSettings
+
         return SimSettings(self.robot, self.seed, self.rate, self.duration, self.speed)
 
 
-SOURCE_KINDS: dict[str, type[BagConfig | Ros1Config | Ros2Config | SimConfig]] = {
-    "bag": BagConfig,
-    "ros1": Ros1Config,
-    "ros2": Ros2Config,
-    "sim": SimConfig,
-}
+AnySource: TypeAlias = BagConfig | Ros1Config | Ros2Config | SimConfig
+SOURCE_KINDS: dict[str, type[AnySource]] = {"bag": BagConfig, "ros1": Ros1Config, "ros2": Ros2Config, "sim": SimConfig}
+_ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
 
 
 def _known_kind(value: Any) -> Any:
     if isinstance(value, dict):
-        kind = value.get("kind")
+        kind, allowed = value.get("kind"), ", ".join(map(repr, SOURCE_KINDS))
         if kind is None:
-            raise ValueError(f"has no kind; allowed: {', '.join(map(repr, SOURCE_KINDS))}")
+            raise ValueError(f"has no kind; allowed: {allowed}")
         if kind not in SOURCE_KINDS:
             near = difflib.get_close_matches(str(kind), SOURCE_KINDS, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"has kind {kind!r}; allowed: {', '.join(map(repr, SOURCE_KINDS))}{hint}")
+            raise ValueError(f"has kind {kind!r}; allowed: {allowed}{hint}")
     elif value is not None and not isinstance(value, Section):
         raise ValueError(f'is {value!r}; write a table, such as [source] with kind = "bag"')
     return value
 
 
-AnySource: TypeAlias = BagConfig | Ros1Config | Ros2Config | SimConfig
 SourceConfig: TypeAlias = Annotated[AnySource, Discriminator("kind")]
-_ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
 
 
 def source_of_environment(environment: Mapping[str, str]) -> tuple[AnySource, str]:
-    """The source of a robot that is configured with none: the ROS that is set up there, or a simulation; and why."""
+    """The source of a robot that is configured with none: the ROS that is set up there, and how it is known.
+
+    ConfigError where no ROS is: a simulation in its place would sign invented records.
+    """
     version, distribution = environment.get("ROS_VERSION"), environment.get("ROS_DISTRO")
     if version in ("1", "2"):
         kind, why = f"ros{version}", f"ROS_VERSION is {version}"
@@ -299,79 +314,86 @@ def source_of_environment(environment: Mapping[str, str]) -> tuple[AnySource, st
     elif distribution:
         kind, why = "ros1" if distribution in _ROS1_DISTRIBUTIONS else "ros2", f"ROS_DISTRO is {distribution}"
     else:
-        kind, why = "sim", "there is no [source] and no ROS in the environment: nothing real is recorded"
+        raise ConfigError(
+            "robot.toml has no [source] and the environment speaks of no ROS (ROS_VERSION, ROS_MASTER_URI,"
+            ' ROS_DISTRO): set ROS up in this shell, or write [source] with kind = "ros1", "ros2", "bag" or, to try'
+            ' it out with invented messages, "sim"'
+        )
     return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
 
 
+class LogConfig(Section):
+    """The log that the robot writes: what was captured in a `period`, from all topics, is one chunk of it.
+
+    period: A chunk closes so long after its first record, or when it is full. A power cut costs what was captured in
+    it; a longer one costs less gas a record.
+
+    heartbeat: With nothing to say for so long, an empty chunk is written, so that silence can be told from withholding.
+
+    compress: Turned off, the size of a chunk no longer tells how alike its records are: who feeds one topic could
+    guess at another by it.
+    """
+
+    period: Annotated[float, seconds("50ms", "1h")] = 1.0
+    heartbeat: Annotated[float, seconds("10s", "7d")] = 3600.0
+    compress: bool = True
+
+
 class SpoolConfig(Section):
-    """Records that the server has not acknowledged; sealed before they get there. When there is no room, `latest`
-    records are dropped first, then the oldest; what was dropped is declared on the chain."""
+    """The log on the robot's disk: what is not confirmed on the chain. When it is full, what the server has goes first,
+    then the bodies of the oldest chunks; the log says so for good.
 
-    max_records: int = Field(default=1_000_000, ge=16, description="Records kept, at most.")
-    max_size: Size = Field(default=256 * MIB, ge=MIB, description="Bytes kept, at most.")
-    commit: Seconds = Field(
-        default=0.05, le=10, description="Group commit: a power failure loses what was captured within so long."
-    )
+    max_size: Bytes kept, at most.
+    """
 
-
-class StreamConfig(Section):
-    """When a new stream, that is, a new key, begins."""
-
-    records: int = Field(default=2**20, ge=16, le=2**32, description="After so many records.")
-    age: DurationNs = Field(default=86_400 * SECOND_NS, description="After so long.")
+    max_size: Annotated[int, size("1 MiB")] = 256 * MIB
 
 
 class RobotConfig(Section):
-    """A robot's configuration, `robot.toml`."""
+    """A robot's configuration, `robot.toml`.
 
-    topics: Annotated[list[Annotated[TopicConfig, BeforeValidator(_table_of_name)]], Field()] = Field(
-        default=[], description="Topics to watch: names, patterns, or tables (below)."
-    )
-    nodes: list[Pattern] = Field(
-        default=[],
-        description="Nodes to watch, by name or pattern: the topics they publish, resolved again every few seconds.",
-    )
-    name: Name | None = Field(
-        default=None, description="The robot's name; without it, the one that it was registered under."
-    )
-    server: HostPort | None = Field(
-        default=None, description="The server's HOST:PORT; without it, the one in the bundle the robot joined with."
-    )
-    channel: Mode = Field(
-        default="exchange",
-        description="How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.",
-    )
-    readers: list[FilePath] | None = Field(
-        default=None,
-        description="Certificates (PEM) of those who may read the records; without it, those the robot joined with.",
-    )
-    acknowledge: Literal["stored", "confirmed"] = Field(
-        default="stored",
-        description="When a reliable record may leave the spool: stored durably by the server, or confirmed on chain.",
-    )
-    monitor: HostPort | None = Field(
-        default=None,
-        description="HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there "
-        "are none. Keep it on the machine or a private network.",
-    )
-    source: Annotated[SourceConfig | None, BeforeValidator(_known_kind)] = Field(
-        default=None,
-        description="Where messages come from (below). Without it, the ROS that the environment speaks of "
-        "(`ROS_VERSION`, `ROS_MASTER_URI`, `ROS_DISTRO`), and where it speaks of none, a simulated robot.",
-    )
-    capture: CaptureConfig = Field(default=CaptureConfig(), description="Defaults for all topics (below).")
-    spool: SpoolConfig = Field(default=SpoolConfig(), description="Records not acknowledged yet (below).")
-    stream: StreamConfig = Field(default=StreamConfig(), description="Change of keys (below).")
+    topics: Topics to watch: names, patterns, or tables (below).
 
-    @model_validator(mode="after")
+    nodes: Nodes to watch, by name or pattern: the topics they publish, resolved again every few seconds.
+
+    server: The server's HOST:PORT; without it, the one in the bundle the robot joined with.
+
+    channel: How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.
+
+    readers: Certificates (PEM) of those who may read the records, 16 at most; without it, those in the folder `readers`
+    of the home.
+
+    monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there are none.
+    Keep it on the machine or a private network.
+
+    source: Where messages come from (below). Without it, the ROS that the environment speaks of (`ROS_VERSION`,
+    `ROS_MASTER_URI`, `ROS_DISTRO`); where it speaks of none, the robot does not start.
+
+    capture: How all topics are captured (below).
+
+    log: The log (below).
+
+    spool: The log on the robot's disk (below).
+    """
+
+    topics: list[Annotated[TopicConfig, BeforeValidator(_table_of_name)]] = []
+    nodes: list[Pattern] = []
+    server: HostPort | None = None
+    channel: Mode = "exchange"
+    readers: list[FilePath] | None = None
+    monitor: HostPort | None = None
+    source: Annotated[SourceConfig | None, BeforeValidator(_known_kind)] = None
+    capture: CaptureConfig = CaptureConfig()
+    log: LogConfig = LogConfig()
+    spool: SpoolConfig = SpoolConfig()
+
+    @validator(mode="after")
     def _consistent(self) -> RobotConfig:
         if not self.topics and not self.nodes:
             raise ValueError('names nothing to watch; write topics = ["/robot_1/odom"] or nodes = ["/robot_1/base"]')
-        seen: set[str] = set()
-        for topic in self.topics:
-            if topic.topic in seen:
-                raise ValueError(f"names topic {topic.topic} twice")
-            seen.add(topic.topic)
+        names = [topic.topic for topic in self.topics]
+        if twice := [name for number, name in enumerate(names) if name in names[:number]]:
+            raise ValueError(f"names topic {twice[0]} twice")
         if self.readers is not None and not self.readers:
             raise ValueError(
                 "has no reader: nobody could open the records; name a certificate in `readers` or leave the key out"
@@ -380,24 +402,13 @@ class RobotConfig(Section):
 
     def rules(self) -> list[TopicRule]:
         """For capture.Capture. What a node publishes is captured by the defaults."""
-        topics = list(self.topics)
-        if self.nodes:
-            topics.append(TopicConfig(topic="**"))
         return [
             TopicRule(
-                topic.topic,
-                tuple(topic.fields),
-                topic.rate,
-                topic.at,
-                topic.once,
-                topic.from_,
-                topic.until,
-                topic.for_,
-                topic.delivery or self.capture.delivery,
-                topic.oversize or self.capture.oversize,
-                self.capture.field_limit,
+                topic.topic, fields=tuple(topic.fields), rate=topic.rate, at_ns=topic.at, once=topic.once,
+                from_ns=topic.from_, until_ns=topic.until, for_ns=topic.for_, oversize=self.capture.oversize,
+                limit=self.capture.field_limit,
             )
-            for topic in topics
+            for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
         ]
 
     def source_and_why(self, environment: Mapping[str, str]) -> tuple[AnySource, str]:
@@ -408,16 +419,15 @@ class RobotConfig(Section):
 
     def selection(self) -> Selection:
         """For sources.open_source."""
+        from rosbridge_eth.sources import Selection
+
         return Selection([topic.topic for topic in self.topics], self.nodes)
 
     def reader_files(self, joined: Path) -> list[Path]:
         """The readers' certificates: as configured, or those in the folder `joined`. ConfigError if there is none."""
-        if self.readers is not None:
-            for file in self.readers:
-                if not file.is_file():
-                    raise ConfigError(f"reader certificate {file} does not exist; correct `readers`")
-            return list(self.readers)
-        files = sorted(joined.glob("*.pem"))
+        files = sorted(joined.glob("*.pem")) if self.readers is None else list(self.readers)
+        if absent := [file for file in files if not file.is_file()]:
+            raise ConfigError(f"reader certificate {absent[0]} does not exist; correct `readers`")
         if not files:
             raise ConfigError(
                 f"no reader: there is no certificate in {joined} and `readers` names none, so nobody could open the "
@@ -429,138 +439,151 @@ class RobotConfig(Section):
 # The server
 
 
-def _chain_url(value: str) -> str:
-    if value == "embedded":
-        return value
-    parts = urlsplit(value)
-    if parts.scheme not in ("http", "https", "ws", "wss") or not parts.hostname:
-        # Not shown: a node's URL often carries a key.
-        raise ValueError('is not a node\'s URL; write "http://127.0.0.1:8545", "wss://...", or "embedded"')
-    return value
-
-
-def _store_url(value: str) -> str:
-    if value == "sqlite":
-        return value
-    parts = urlsplit(value)
-    if parts.scheme not in ("redis", "rediss", "unix"):
-        raise ValueError('is not a store; write "sqlite" or "redis://127.0.0.1:6379/0"')
-    return value
-
-
-ChainUrl: TypeAlias = Annotated[str, AfterValidator(_chain_url)]
-ContractAddress: TypeAlias = Annotated[str, AfterValidator(_contract)]
-
-
 class ChainConfig(Section):
-    """The node and how long to wait before a record counts."""
+    """The node, and how long to wait before a record counts.
 
-    url: ChainUrl = Field(
-        default="embedded",
-        description='JSON-RPC URL of a node, or `"embedded"`: an EVM in the process, for trying out; it ends with it.',
-        repr=False,
-    )
-    confirmations: int = Field(
-        default=1, ge=1, le=10_000, description="Blocks, its own included, after which a transaction is confirmed."
-    )
-    poll: Seconds = Field(default=0.5, le=60, description="How often the node is asked about what is pending.")
-    bump_after: Seconds = Field(
-        default=30.0,
-        le=86_400,
-        description="A transaction that no block holds after so long is sent with a higher fee.",
-    )
-    max_fee_gwei: float = Field(default=500.0, gt=0, description="No transaction offers more per unit of gas.")
-    keep: Seconds = Field(
-        default=3 * 86_400.0, description="Confirmed batches are kept so long, to be sent again after a reorganisation."
-    )
+    url: JSON-RPC URL of a node.
+
+    confirmations: Blocks, its own included, after which a chunk is confirmed.
+
+    max_fee_gwei: No transaction offers more per unit of gas.
+    """
+
+    url: NodeUrl = Field(default="http://127.0.0.1:8545", repr=False)
+    confirmations: int = Field(default=1, ge=1, le=100)
+    max_fee_gwei: float = Field(default=500.0, gt=0)
 
 
 class StoreConfig(Section):
-    """The inbox between the sockets and the chain."""
+    """The inbox: the server's replica of the robots' logs, until they are on the chain.
 
-    url: Annotated[str, AfterValidator(_store_url)] = Field(
-        default="sqlite", description='`"sqlite"`, in the server\'s folder, or the URL of a Redis.', repr=False
-    )
-    max_records: int = Field(default=1_000_000, ge=100, description="Records kept, dead letters included.")
-    max_size: Size = Field(default=GIB, ge=MIB, description="Bytes kept, dead letters included.")
-    remember: Seconds = Field(
-        default=30 * 86_400.0,
-        ge=3600,
-        description="The names of finished records are remembered so long: a record that comes again within it, from a "
-        "robot that never learnt that it was taken, is not written twice.",
-    )
+    url: `"sqlite"`, in the server's folder, or the URL of a Redis.
 
+    max_size: Bytes kept, dead letters included.
 
-class BatchConfig(Section):
-    """One batch is one transaction of one robot; it is closed at whichever limit comes first."""
+    share: Bytes of one robot. Above it, that robot waits, and no other.
+    """
 
-    records: int = Field(default=100, ge=1, le=1000, description="Records.")
-    size: Size = Field(default=96 * KIB, ge=33 * KIB, le=120 * KIB, description="Bytes of calldata.")
-    gas: int = Field(default=8_000_000, ge=200_000, description="Gas.")
-    age: Seconds = Field(default=2.0, le=3600, description="How long the first record waits for others.")
+    url: StoreUrl = Field(default="sqlite", repr=False)
+    max_size: Annotated[int, size("1 MiB")] = GIB
+    share: Annotated[int, size("1 MiB")] = 64 * MIB
 
 
 class FundsConfig(Section):
-    """Robots' accounts are topped up by the operator's."""
+    """Robots' accounts are topped up by the operator's; what one robot can spend is bounded.
 
-    below: float = Field(default=0.05, gt=0, lt=5, description="Top up when an account has less ETH than this.")
-    by: float = Field(default=0.5, gt=0, le=5, description="By so much ETH. The contract refuses above 5 ETH.")
+    below: Top up when an account has less ETH than this.
+
+    by: By so much ETH. The contract refuses above 5 ETH.
+
+    gas_per_day: Gas that one robot may use in 24 hours; what is above it waits. The default is enough for about 100
+    records a second.
+    """
+
+    below: float = Field(default=0.05, gt=0, lt=5)
+    by: float = Field(default=0.5, gt=0, le=5)
+    gas_per_day: int = Field(default=30_000_000_000, ge=1_000_000)
 
 
 class LimitsConfig(Section):
-    """Bounds on what strangers and robots can make the server do; per worker process."""
+    """Bounds on what strangers and robots can make the server do; per worker process.
 
-    connections: int = Field(default=4096, ge=1, description="Sessions.")
-    half_open: int = Field(default=1024, ge=1, description="Handshakes that are under way.")
-    handshake_share: float = Field(default=0.5, gt=0, le=1, description="Share of time that handshakes may take.")
-    source_rate: float = Field(default=10.0, gt=0, description="Handshakes per second that one address may fail.")
-    source_burst: float = Field(default=400.0, ge=1, description="And at once.")
-    unanswered: int = Field(default=256, ge=1, description="Messages of one session that wait for their answer.")
-    memory: Size = Field(default=64 * MIB, ge=MIB, description="Bytes of messages under way, all sessions together.")
+    connections: Sessions.
+
+    handshakes: Handshakes per second that one address may fail, and 40 times as many at once.
+    """
+
+    connections: int = Field(default=4096, ge=1)
+    handshakes: float = Field(default=10.0, gt=0)
 
 
 class ServerConfig(Section):
-    """The server's configuration, `server.toml`."""
+    """The server's configuration, `server.toml`.
 
-    listen: HostPort = Field(default=Address("0.0.0.0", 7410), description="UDP address of the robots' door.")  # noqa: S104 - a server's default
-    public: HostPort | None = Field(
-        default=None, description="The address that robots are given in their bundles; without it, `listen`."
-    )
-    name: Name = Field(default="server", description="The name in the server's certificate.")
-    workers: int = Field(default=1, ge=1, le=64, description="Processes that share the port.")
-    channel: list[Mode] = Field(
-        default=["exchange"],
-        min_length=1,
-        description='Handshake modes that are taken: `"exchange"`, and `"transport"` where it is wanted.',
-    )
-    monitor: HostPort | None = Field(
-        default=None,
-        description="HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9464`; without it there "
-        "are none. Whoever reaches it reads names, balances and counts: keep it on the machine or a private network.",
-    )
-    chain: ChainConfig = Field(default=ChainConfig(), description="The node (below).")
-    store: StoreConfig = Field(default=StoreConfig(), description="The inbox (below).")
-    batch: BatchConfig = Field(default=BatchConfig(), description="Records per transaction (below).")
-    funds: FundsConfig = Field(default=FundsConfig(), description="Robots' accounts (below).")
-    limits: LimitsConfig = Field(default=LimitsConfig(), description="Bounds (below).")
+    listen: UDP address of the robots' door.
+
+    public: The address that robots are given in their bundles; without it, `listen`.
+
+    name: The name in the server's certificate.
+
+    workers: Processes that share the port.
+
+    channel: Handshake modes that are taken: `"exchange"`, and `"transport"` where it is wanted.
+
+    monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9464`; without it there are none.
+    Whoever reaches it reads names, balances and counts: keep it on the machine or a private network.
+
+    passphrase_file: A file whose first line is the operator passphrase, for commands that are given none and a server
+    that starts by itself. Whoever reads it and the home is the operator.
+
+    chain: The node (below).
+
+    store: The inbox (below).
+
+    funds: Robots' accounts (below).
+
+    limits: Bounds (below).
+    """
+
+    listen: HostPort = Address("0.0.0.0", 7410)  # noqa: S104 - a server's default
+    public: HostPort | None = None
+    name: Name = "server"
+    workers: int = Field(default=1, ge=1, le=64)
+    channel: list[Mode] = Field(default=["exchange"], min_length=1)
+    monitor: HostPort | None = None
+    passphrase_file: FilePath | None = None
+    chain: ChainConfig = ChainConfig()
+    store: StoreConfig = StoreConfig()
+    funds: FundsConfig = FundsConfig()
+    limits: LimitsConfig = LimitsConfig()
+
+    def address_for_robots(self) -> Address:
+        """`public`, or `listen`; ConfigError where that is no address that a robot could send to."""
+        address = self.public or self.listen
+        if address.port == 0 or address.host in ("0.0.0.0", "::"):  # noqa: S104 - that is what is refused
+            raise ConfigError(
+                f"robots would be told to send to {address}, which is no machine's address: write into server.toml"
+                ' public = "HOST:PORT", as robots reach the server'
+            )
+        return address
 
 
 # The reader
 
 
 class ReaderConfig(Section):
-    """A reader's configuration, `reader.toml`: all it takes to read, the server is not asked."""
+    """A reader's configuration, `reader.toml`: all it takes to read, the server is not asked.
 
-    contract: ContractAddress = Field(description="The contract's address.")
-    ca: FilePath = Field(description="The operator's CA certificate (PEM).")
-    identity: FilePath = Field(description="Folder of the reader's keys and certificates.")
-    chain: ChainUrl = Field(
-        default="http://127.0.0.1:8545", description="JSON-RPC URL of any node of the chain.", repr=False
+    contract: The contract's address.
+
+    chain_id: The chain's id, which every signature covers.
+
+    genesis: The hash of the chain's first block, which every signature covers, too.
+
+    ca: The operator's CA certificate (PEM).
+
+    identity: Folder of the reader's keys and certificates.
+
+    chain: JSON-RPC URL of a node of the chain, or a list of them: all are asked, the highest count holds, and where
+    they disagree it is told.
+
+    from_block: The block of the contract's deployment, or later; what a robot wrote before it is not read.
+    """
+
+    contract: ContractAddress
+    chain_id: int = Field(ge=1)
+    genesis: Hash
+    ca: FilePath
+    identity: FilePath
+    chain: Annotated[list[NodeUrl], BeforeValidator(_listed)] = Field(
+        default=["http://127.0.0.1:8545"], min_length=1, repr=False
     )
-    from_block: int = Field(
-        default=0, ge=0,
-        description="The block of the contract's deployment, or later; what a robot wrote before it is not read.",
-    )
+    from_block: int = Field(default=0, ge=0)
+
+    @property
+    def ledger(self) -> bytes:
+        """What every signature of a log covers, 32 bytes (chunk.ledger_id)."""
+        return ledger_of(self.chain_id, self.genesis, self.contract)
 
 
-ROOTS: tuple[type[Section], ...] = (RobotConfig, ServerConfig, ReaderConfig)
+ROOTS: dict[str, type[Section]] = {"robot.toml": RobotConfig, "server.toml": ServerConfig, "reader.toml": ReaderConfig}

@@ -5,24 +5,27 @@
     size       "64 MiB"  "500 kB"  or a number of bytes
     address    "192.0.2.7:7410"  "robots.example:7410"  "[2001:db8::7]:7410"
 
-Each parser takes the value TOML gave and raises ValueError with the rest of a
-sentence that begins with the key.
+Each parser takes the value TOML gave and raises ValueError with the rest of a sentence that begins with the key.
+`Written` makes a parser, its bounds and its word in the reference one annotation of a model's field.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BeforeValidator, ValidationInfo
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo, WithJsonSchema
+from pydantic_core import CoreSchema, core_schema
 
 _UNITS_NS = {"ms": 10**6, "s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9, "d": 86400 * 10**9}
 _PART = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?(ms|s|m|h|d)", re.ASCII)
 _DURATION = re.compile(rf"{_PART.pattern}(?: ?{_PART.pattern})*", re.ASCII)
 _SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
-SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
+_SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
 _HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]{1,253}):(\d{1,5})", re.ASCII)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -62,7 +65,7 @@ def parse_size(value: Any) -> int:
     """Bytes."""
     if isinstance(value, int) and not isinstance(value, bool) and value > 0:
         return value
-    match = SIZE.fullmatch(value) if isinstance(value, str) else None
+    match = _SIZE.fullmatch(value) if isinstance(value, str) else None
     size = round(float(match[1]) * _SIZES[match[2]]) if match else 0
     if size < 1:
         raise ValueError(f'is {value!r}; write a size such as "64 MiB", "500 kB" or a number of bytes')
@@ -87,21 +90,17 @@ def parse_address(value: Any) -> Address:
     return Address(match[1].strip("[]"), int(match[2]))
 
 
-def parse_path(value: Any, info: ValidationInfo) -> Path:
-    """A path; a relative one starts at the folder of the configuration file."""
-    if not isinstance(value, str) or not value or "\0" in value:
-        raise ValueError(f"is {value!r}; write a path in quotes")
-    folder = info.context.get("folder") if info.context else None
-    path = Path(value).expanduser()
-    return folder / path if isinstance(folder, Path) else path
-
-
 def duration_text(seconds: float) -> str:
     """As a person writes it."""
-    for length, unit in ((86_400, "d"), (3600, "h"), (60, "m"), (1, "s")):
-        if seconds >= length and seconds % length == 0:
-            return f"{round(seconds / length)}{unit}"
-    return f"{round(seconds * 1000)}ms"
+    units = ((86_400, "d"), (3600, "h"), (60, "m"), (1, "s"))
+    fits = [f"{round(seconds / unit)}{name}" for unit, name in units if seconds >= unit and seconds % unit == 0]
+    return fits[0] if fits else f"{round(seconds * 1000)}ms"
+
+
+def size_text(size: int) -> str:
+    """As a person writes it."""
+    units = ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB"), (1, "B"))
+    return next(f"{size // unit} {name}" for unit, name in units if size % unit == 0)
 
 
 def time_text(nanoseconds: int) -> str:
@@ -110,17 +109,51 @@ def time_text(nanoseconds: int) -> str:
     return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
-def size_text(size: int) -> str:
-    """As a person writes it."""
-    for length, unit in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
-        if size >= length and size % length == 0:
-            return f"{size // length} {unit}"
-    return f"{size} B"
+@dataclass(frozen=True, slots=True)
+class Written:
+    """How pydantic reads a value with a unit: its word in the reference, its parser, bounds as a person writes them."""
+
+    word: str
+    parse: Callable[[Any], Any]
+    low: str = ""
+    high: str = ""
+
+    def read(self, value: Any) -> Any:
+        found = self.parse(value)
+        if self.low and found < self.parse(self.low):
+            raise ValueError(f"is {value!r}; it should be at least {self.low!r}")
+        if self.high and found > self.parse(self.high):
+            raise ValueError(f"is {value!r}; it should be at most {self.high!r}")
+        return found
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        bounds = {"minimum": self.low, "maximum": self.high}
+        return {"type": self.word, **{name: bound for name, bound in bounds.items() if bound}}
 
 
-DurationNs = Annotated[int, BeforeValidator(parse_duration)]
-Seconds = Annotated[float, BeforeValidator(parse_seconds)]
-TimeNs = Annotated[int, BeforeValidator(parse_time)]
-Size = Annotated[int, BeforeValidator(parse_size)]
-HostPort = Annotated[Address, BeforeValidator(parse_address)]
-FilePath = Annotated[Path, BeforeValidator(parse_path)]
+def seconds(low: str = "", high: str = "") -> Written:
+    """A duration in seconds."""
+    return Written("duration", parse_seconds, low, high)
+
+
+def size(low: str = "1 B", high: str = "") -> Written:
+    """A number of bytes."""
+    return Written("size", parse_size, low, high)
+
+
+def _path(value: Any, info: ValidationInfo) -> Path:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"is {value!r}; write a path in quotes")
+    folder = info.context.get("folder") if info.context else None
+    path = Path(value).expanduser()
+    return folder / path if isinstance(folder, Path) else path
+
+
+DurationNs = Annotated[int, Written("duration", parse_duration)]
+TimeNs = Annotated[int, Written("time", parse_time)]
+HostPort = Annotated[Address, Written("address", parse_address)]
+FilePath = Annotated[Path, BeforeValidator(_path), WithJsonSchema({"type": "path"})]
+"""A relative path starts at the folder of the configuration file."""
