@@ -4,63 +4,62 @@ pragma solidity 0.8.37;
 /// @title The ledger of robots: who may write, and what was written.
 ///
 /// A robot is known by Tk = keccak256(name), an identity and not a secret; authority is the sender.
-/// Records are kept as events, and each batch of them as one Merkle root in storage: what a reader
-/// takes from the events is proven by the root, and that no batch is withheld by the count.
+/// What a robot writes are the chunks of its log, byte strings whose content this contract does not
+/// look into. They are numbered from 0 in the order written and kept as events; storage keeps their
+/// number, the hash of the last one, and one hash for each batch.
 ///
-/// Records are packed, so that a byte of calldata is a byte of record:
+/// A batch is taken only if it says which chunk it follows: its number, and the hash of the one in
+/// front (Raft's rule). So each chunk is written once and in order, however often it is sent and
+/// whoever sends it; and a sender that does not know what is there writes nothing.
 ///
-///     records := run+
-///     run     := stream (16) | first seq (8) | count (2) | count * ( length (2) | ciphertext )
-///
-/// with big-endian integers, every count and length at least 1; record i of a run has seq
-/// first + i. Other bytes, or too few of them, revert.
-///
-/// Leaf    keccak256(0x00 | Tk | stream (16) | seq (8) | keccak256(ciphertext))
-/// Node    keccak256(0x01 | left | right); an odd node moves up unchanged (the tree of RFC 9162, 2.1.1)
-///
-/// Events of one robot are linked: each carries the block of the one before it, and `robots` the
-/// block of the last, so a reader walks from block to block and need never scan; batches are
-/// numbered from 1 in the order written, so a reader sees if a node withholds one.
+/// Events of one robot are linked: each carries the block of the one before it, and `standings` the
+/// block of the last, so a reader walks from block to block and need never scan; the numbers are
+/// dense, so a reader sees if a node withholds a batch. `index` in Registered and Revoked is the
+/// number of the first chunk for which they hold: which registration governs a chunk needs no clock.
 contract RobotLedger {
     /// A robot's account is not topped up beyond this.
     uint256 public constant BALANCE_LIMIT = 5 ether;
 
-    /// Bound to the account that may write for it. The first slot is all that a write touches.
+    /// A write changes the first two slots and nothing else of it.
     struct Robot {
         address account;
         bool revoked;
-        uint40 batches; // how many were recorded; indices need not be dense
-        uint40 batchBlock; // of the last Batch event
-        uint64 registeredAt; // block of the present registration
-        uint64 revokedAt; // block; 0 while it may write
-        uint64 changedAt; // block of the last Registered or Revoked event
-        uint64 generation; // 1 for the first registration, one more for each replacement
+        uint40 chunks; // how many were written
+        uint40 dataBlock; // of the last Data event; 0 if there is none
+        bytes32 tail; // keccak256 of the last chunk; 0 if there is none
         bytes32 certificatesHash; // keccak256 of what Registered carried
+        uint256 changedBlock; // of the last Registered or Revoked event
+    }
+
+    /// What `standings` answers for one robot; all zero for a name never registered.
+    struct Standing {
+        address account;
+        bytes32 certificatesHash;
+        bool revoked;
+        uint256 chunks;
+        bytes32 tail;
+        uint256 balance; // of the account, wei
+        uint256 dataBlock;
+        uint256 changedBlock;
     }
 
     address public operator;
     address public offeredOperator;
 
-    mapping(bytes32 Tk => Robot) public robots;
+    mapping(bytes32 Tk => Robot) private robots;
 
     /// The robot an account was ever bound to: an account serves one robot, for good.
     mapping(address account => bytes32 Tk) public robotOf;
 
-    /// Merkle root of a batch; zero is free.
-    mapping(bytes32 Tk => mapping(uint256 batchIndex => bytes32)) public root;
+    /// keccak256 over the hashes of a batch's chunks, by the number of its first chunk.
+    mapping(bytes32 Tk => mapping(uint256 first => bytes32)) public batch;
 
     event Registered(
-        bytes32 indexed Tk, address indexed account, uint64 generation, uint64 previousBlock, bytes certificates
+        bytes32 indexed Tk, address indexed account, uint256 index, uint256 previousBlock, bytes certificates
     );
-    event Revoked(bytes32 indexed Tk, address indexed account, uint64 generation, uint64 previousBlock);
-    event Batch(
-        bytes32 indexed Tk,
-        uint256 indexed batchIndex,
-        address indexed account,
-        bytes32 root,
-        uint64 number,
-        uint64 previousBlock,
-        bytes records
+    event Revoked(bytes32 indexed Tk, address indexed account, uint256 index, uint256 previousBlock);
+    event Data(
+        bytes32 indexed Tk, uint256 indexed first, address indexed account, uint256 previousBlock, bytes[] chunks
     );
     event ETHAllocated(bytes32 indexed Tk, address indexed account, uint256 amount);
     event OperatorOffered(address indexed operator, address indexed offered);
@@ -71,12 +70,11 @@ contract RobotLedger {
     error ZeroArgument();
     error NotRegistered(bytes32 Tk);
     error AlreadyRegistered(bytes32 Tk, address account);
-    error AlreadyRevoked(bytes32 Tk, uint256 revokedAt);
+    error AlreadyRevoked(bytes32 Tk);
     error AccountInUse(address account, bytes32 Tk);
     error NotTheRobot(bytes32 Tk, address sender);
     error NoBalance(address sender);
-    error MalformedRecords(uint256 position);
-    error BatchIndexTaken(bytes32 Tk, uint256 batchIndex, bytes32 root);
+    error NotNext(bytes32 Tk, uint256 chunks, bytes32 tail);
     error AccountNotRegistered(address account);
     error AboveLimit(address account, uint256 balance);
     error TransferFailed(address account);
@@ -115,9 +113,7 @@ contract RobotLedger {
         onlyOperator
         returns (address)
     {
-        Robot storage robot = robots[Tk];
-        if (robot.account == address(0)) revert NotRegistered(Tk);
-        if (!robot.revoked) _revoke(Tk);
+        if (robots[Tk].account == address(0)) revert NotRegistered(Tk);
         return _register(Tk, account, certificates);
     }
 
@@ -125,8 +121,10 @@ contract RobotLedger {
     function revokeRobot(bytes32 Tk) external onlyOperator {
         Robot storage robot = robots[Tk];
         if (robot.account == address(0)) revert NotRegistered(Tk);
-        if (robot.revoked) revert AlreadyRevoked(Tk, robot.revokedAt);
-        _revoke(Tk);
+        if (robot.revoked) revert AlreadyRevoked(Tk);
+        robot.revoked = true;
+        emit Revoked(Tk, robot.account, robot.chunks, robot.changedBlock);
+        robot.changedBlock = block.number;
     }
 
     /// Pass the value sent on to a robot's account.
@@ -155,96 +153,55 @@ contract RobotLedger {
 
     // ------------------------------------------------------------------ the robot
 
-    /// Record one ciphertext Cp: a batch of one.
-    function setData(bytes32 Tk, uint256 batchIndex, bytes16 stream, uint64 seq, bytes calldata Cp)
-        external
-        returns (bytes32 newRoot)
-    {
-        if (Cp.length == 0 || Cp.length > type(uint16).max) revert MalformedRecords(0);
-        newRoot = _leaf(Tk, stream, seq, keccak256(Cp));
-        (bool fresh, uint64 number, uint64 previousBlock) = _claim(Tk, batchIndex, newRoot);
-        if (fresh) {
-            bytes memory records = abi.encodePacked(stream, seq, uint16(1), uint16(Cp.length), Cp);
-            emit Batch(Tk, batchIndex, msg.sender, newRoot, number, previousBlock, records);
-        }
-    }
+    /// Write the chunks that follow the first `first` ones, the last of which has the hash `tail`
+    /// (0 if there is none).
+    function setData(bytes32 Tk, uint256 first, bytes32 tail, bytes[] calldata chunks) external {
+        Robot storage robot = robots[Tk];
+        if (robot.account == address(0)) revert NotRegistered(Tk);
+        if (robot.account != msg.sender) revert NotTheRobot(Tk, msg.sender);
+        if (robot.revoked) revert AlreadyRevoked(Tk);
+        if (msg.sender.balance == 0) revert NoBalance(msg.sender);
+        if (chunks.length == 0) revert ZeroArgument();
+        if (first != robot.chunks || tail != robot.tail) revert NotNext(Tk, robot.chunks, robot.tail);
 
-    /// Record many: one event, and their Merkle root in storage. Writing the same batch again
-    /// returns quietly, another one under the same index reverts: a write may be repeated.
-    function setBatch(bytes32 Tk, uint256 batchIndex, bytes calldata records) external returns (bytes32 newRoot) {
-        newRoot = merkleRoot(Tk, records);
-        (bool fresh, uint64 number, uint64 previousBlock) = _claim(Tk, batchIndex, newRoot);
-        if (fresh) emit Batch(Tk, batchIndex, msg.sender, newRoot, number, previousBlock, records);
+        bytes32[] memory hashes = new bytes32[](chunks.length);
+        for (uint256 i = 0; i < chunks.length; ++i) hashes[i] = keccak256(chunks[i]);
+        batch[Tk][first] = keccak256(abi.encodePacked(hashes));
+        emit Data(Tk, first, msg.sender, robot.dataBlock, chunks);
+        robot.tail = hashes[chunks.length - 1];
+        (robot.chunks, robot.dataBlock) = (uint40(first + chunks.length), uint40(block.number));
     }
 
     // ------------------------------------------------------------------ anyone
 
-    /// Is this ciphertext recorded for this robot, as leaf `leaf` of `leaves` in that batch?
-    /// A revoked robot's records stay recorded; a name never registered reverts.
-    /// @param proof the sibling hashes from the leaf upwards; its length is exact.
-    function checkData(
-        bytes32 Tk,
-        uint256 batchIndex,
-        bytes16 stream,
-        uint64 seq,
-        bytes calldata Cp,
-        uint256 leaf,
-        uint256 leaves,
-        bytes32[] calldata proof
-    ) external view returns (bool) {
+    /// Is `chunk` the i-th, counted from 0, of the batch that begins with number `first`?
+    /// A revoked robot's chunks stay recorded; a name never registered reverts.
+    /// @param hashes keccak256 of every chunk of that batch, in order.
+    function checkData(bytes32 Tk, uint256 first, bytes32[] calldata hashes, uint256 i, bytes calldata chunk)
+        external
+        view
+        returns (bool)
+    {
         if (robots[Tk].account == address(0)) revert NotRegistered(Tk);
-        bytes32 node = _leaf(Tk, stream, seq, keccak256(Cp));
-        if (leaf >= leaves) return false;
-        uint256 last = leaves - 1;
-        uint256 used = 0;
-        while (last > 0) {
-            if (leaf % 2 == 1) {
-                if (used == proof.length) return false;
-                node = _node(proof[used++], node);
-            } else if (leaf < last) {
-                if (used == proof.length) return false;
-                node = _node(node, proof[used++]);
-            } // else odd: it moves up unchanged
-            leaf /= 2;
-            last /= 2;
-        }
-        return used == proof.length && node == root[Tk][batchIndex];
+        return i < hashes.length && hashes[i] == keccak256(chunk)
+            && keccak256(abi.encodePacked(hashes)) == batch[Tk][first];
     }
 
-    /// Merkle root of packed records. One pass: stack[k] is the root of a full tree of 2**k
-    /// leaves where bit k of the number of leaves is set; the smaller trees join from the right.
-    /// Unchecked arithmetic: positions are below 2**32 (calldata is paid for), seq below 2**65.
-    function merkleRoot(bytes32 Tk, bytes calldata records) public pure returns (bytes32 node) {
-        unchecked {
-            bytes32[32] memory stack;
-            uint256 leaves = 0;
-            uint256 position = 0;
-            uint256 end = records.length;
-            while (position < end) {
-                if (position + 26 > end) revert MalformedRecords(position);
-                bytes16 stream = bytes16(records[position:position + 16]);
-                uint256 seq = uint64(bytes8(records[position + 16:position + 24]));
-                uint256 after_ = seq + uint16(bytes2(records[position + 24:position + 26]));
-                if (after_ == seq || after_ > 1 << 64) revert MalformedRecords(position);
-                position += 26;
-                for (; seq < after_; ++seq) {
-                    if (position + 2 > end) revert MalformedRecords(position);
-                    uint256 length = uint16(bytes2(records[position:position + 2]));
-                    if (length == 0 || position + 2 + length > end) revert MalformedRecords(position);
-                    node = _leaf(Tk, stream, uint64(seq), keccak256(records[position + 2:position + 2 + length]));
-                    position += 2 + length;
-                    uint256 level = 0;
-                    for (uint256 n = leaves++; n % 2 == 1; n /= 2) node = _node(stack[level++], node);
-                    stack[level] = node;
-                }
-            }
-            if (leaves == 0) revert MalformedRecords(0);
-            uint256 k = 0;
-            while (leaves >> k & 1 == 0) ++k;
-            node = stack[k];
-            for (++k; leaves >> k > 0; ++k) {
-                if (leaves >> k & 1 == 1) node = _node(stack[k], node);
-            }
+    /// How these robots stand, in the order asked.
+    function standings(bytes32[] calldata Tks) external view returns (Standing[] memory answer) {
+        answer = new Standing[](Tks.length);
+        for (uint256 i = 0; i < Tks.length; ++i) {
+            Robot storage robot = robots[Tks[i]];
+            answer[i] = Standing(
+                robot.account,
+                robot.certificatesHash,
+                robot.revoked,
+                robot.chunks,
+                robot.tail,
+                robot.account == address(0) ? 0 : robot.account.balance,
+                robot.dataBlock,
+                robot.changedBlock
+            );
         }
     }
 
@@ -258,65 +215,9 @@ contract RobotLedger {
         Robot storage robot = robots[Tk];
         robot.account = account;
         robot.revoked = false;
-        robot.revokedAt = 0;
-        robot.registeredAt = uint64(block.number);
-        robot.generation += 1;
         robot.certificatesHash = keccak256(certificates);
-        emit Registered(Tk, account, robot.generation, robot.changedAt, certificates);
-        robot.changedAt = uint64(block.number);
+        emit Registered(Tk, account, robot.chunks, robot.changedBlock, certificates);
+        robot.changedBlock = block.number;
         return account;
-    }
-
-    function _revoke(bytes32 Tk) private {
-        Robot storage robot = robots[Tk];
-        robot.revoked = true;
-        robot.revokedAt = uint64(block.number);
-        emit Revoked(Tk, robot.account, robot.generation, robot.changedAt);
-        robot.changedAt = uint64(block.number);
-    }
-
-    /// Take the index for this root, once: False if it was taken for this very root before.
-    function _claim(bytes32 Tk, uint256 batchIndex, bytes32 newRoot)
-        private
-        returns (bool fresh, uint40 number, uint40 previousBlock)
-    {
-        Robot storage robot = robots[Tk];
-        if (robot.account == address(0)) revert NotRegistered(Tk);
-        if (robot.account != msg.sender) revert NotTheRobot(Tk, msg.sender);
-        if (robot.revoked) revert AlreadyRevoked(Tk, robot.revokedAt);
-        if (msg.sender.balance == 0) revert NoBalance(msg.sender);
-        bytes32 kept = root[Tk][batchIndex];
-        if (kept != 0) {
-            if (kept != newRoot) revert BatchIndexTaken(Tk, batchIndex, kept);
-            return (false, 0, 0);
-        }
-        root[Tk][batchIndex] = newRoot;
-        (number, previousBlock) = (robot.batches + 1, robot.batchBlock);
-        (robot.batches, robot.batchBlock) = (number, uint40(block.number));
-        return (true, number, previousBlock);
-    }
-
-    // Both hash beyond the end of used memory, which the next write overwrites: nothing is allocated.
-
-    function _leaf(bytes32 Tk, bytes16 stream, uint64 seq, bytes32 ciphertextHash) private pure returns (bytes32 hash) {
-        assembly ("memory-safe") {
-            let free := mload(0x40)
-            mstore8(free, 0)
-            mstore(add(free, 1), Tk)
-            mstore(add(free, 33), stream) // left-aligned; seq overwrites the zeros behind it
-            mstore(add(free, 49), shl(192, seq))
-            mstore(add(free, 57), ciphertextHash)
-            hash := keccak256(free, 89)
-        }
-    }
-
-    function _node(bytes32 left, bytes32 right) private pure returns (bytes32 hash) {
-        assembly ("memory-safe") {
-            let free := mload(0x40)
-            mstore8(free, 1)
-            mstore(add(free, 1), left)
-            mstore(add(free, 33), right)
-            hash := keccak256(free, 65)
-        }
     }
 }

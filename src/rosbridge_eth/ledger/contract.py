@@ -1,362 +1,601 @@
-"""The contract as Python sees it: calldata, answers, events and errors of contracts/RobotLedger.sol.
+"""The contract RobotLedger on a node, through web3.py.
 
-Everything follows the ABI in the packaged artifact. `Contract.at` makes sure
-that the code at the address is this very contract: one that only looks like
-it could accept records and lose them.
+Names are the contract's (contracts/RobotLedger.sol, docs/ledger.md): Tk is a
+robot's 32 bytes, `first` the number of a batch's first chunk, `tail` the
+keccak256 of the last chunk written. Addresses are EIP-55 strings, amounts wei.
+
+Whatever a node answers ends in a value of the stated form or in a ChainError;
+transport.py has the errors and bounds every answer in time and size. An
+answer is believed as far as its form goes: what it says is the reader's to judge.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, cached_property
 from importlib import resources
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from eth_utils.crypto import keccak
-
-from rosbridge_eth.errors import ChainError, VerificationError
-from rosbridge_eth.ledger.chain import Call, Chain, Log, Receipt
-from rosbridge_eth.ledger.failures import NodeFailure, Reverted
-from rosbridge_eth.ledger.transactions import Fees, Transaction, sign
-from rosbridge_eth.records import SealedRecord
+from rosbridge_eth.chunk import ledger_id
+from rosbridge_eth.errors import ChainError
+from rosbridge_eth.ledger.transport import (
+    AlreadyKnown,
+    ChainUnavailable,
+    NonceTooLow,
+    Reverted,
+    TooMuch,
+    Underpriced,
+    classify,
+    printable,
+    session,
+    shown,
+)
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
 
-BALANCE_LIMIT = 5 * 10**18  # BALANCE_LIMIT of the contract, wei
-GAS_MARGIN_PERCENT = 20  # over the estimate: another batch may have changed what the estimate saw
-NO_ADDRESS = "0x" + "0" * 40
+WEI_PER_ETH = 10**18
+BALANCE_LIMIT = 5 * WEI_PER_ETH  # allocETH does not go beyond it
+NOTHING = bytes(32)  # the tail of a robot that wrote no chunk
+PAGE = 500  # robots in one `standings`
+SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
+BATCH = 50  # requests in one HTTP request
+BATCH_BYTES = 4 * 2**20  # geth takes 5 MiB
+_FORM = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError)  # of what json held
+
+
+class Standing(NamedTuple):
+    """How a robot stands in the contract. `account` is None for a name never registered."""
+
+    account: str | None
+    certificates_hash: bytes
+    revoked: bool
+    chunks: int
+    tail: bytes
+    balance: int
+    data_block: int
+    changed_block: int
+
+
+class DataEvent(NamedTuple):
+    """A batch of chunks. `previous_block` holds the robot's batch before, 0 if there is none."""
+
+    first: int
+    previous_block: int
+    chunks: tuple[bytes, ...]
+    block: int
+    transaction: bytes
+    account: str
+
+
+class RegistrationEvent(NamedTuple):
+    """A registration or revocation that holds from chunk number `index`; `certificates` is b'' for the latter."""
+
+    account: str
+    certificates: bytes
+    index: int
+    previous_block: int
+    block: int
+    revoked: bool
+
+
+class Block(NamedTuple):
+    """A block's header as far as it is looked at. `time`: UTC seconds; `base_fee` is None before London."""
+
+    number: int
+    time: int
+    hash: bytes
+    gas_limit: int
+    base_fee: int | None
+
+
+class Fees(NamedTuple):
+    """What a unit of gas may cost, wei: `highest` at most, of it `tip` to the miner. tip None: before London."""
+
+    highest: int
+    tip: int | None
+
+    def at_least(self, other: Fees) -> Fees:
+        if self.tip is None or other.tip is None:
+            return Fees(max(self.highest, other.highest), None)
+        return Fees(max(self.highest, other.highest), max(self.tip, other.tip))
+
+    def raised(self) -> Fees:
+        """An eighth more of both; nodes ask for a tenth more to replace a transaction."""
+        return Fees(self.highest * 9 // 8 + 1, None if self.tip is None else self.tip * 9 // 8 + 1)
+
+    def limited(self, limit: int) -> Fees:
+        return Fees(min(self.highest, limit), None if self.tip is None else min(self.tip, limit))
+
+
+class Signed(NamedTuple):
+    raw: bytes
+    hash: bytes
+
+
+class Receipt(NamedTuple):
+    hash: bytes
+    block: int
+    succeeded: bool
+    gas_used: int
+    contract: str | None
+
+
+def set_data_gas(chunks: Sequence[int]) -> int:
+    """A gas limit for setData with chunks of these many bytes: never too low, above what is used by a tenth or so.
+
+    Linear, so that no node has to estimate it. 40 a byte of calldata is the floor of EIP-7623 and more than the byte
+    takes in execution (16 calldata, 8 event, about 1 for hashing and memory); tests/bridge/ledger holds it against
+    the EVM.
+    """
+    return 120_000 + sum(40 * (-size // 32 * -32) + 3_500 for size in chunks)
+
+
+def call_gas(data: bytes) -> int:
+    """A gas limit for any other call of the contract."""
+    return 250_000 + 40 * len(data)
 
 
 @cache
 def artifact() -> dict[str, Any]:
-    """The packaged artifact: abi, bytecode, deployedBytecode, compiler, settings."""
-    text = resources.files("rosbridge_eth.ledger").joinpath("artifact/RobotLedger.json").read_text("utf-8")
-    loaded: dict[str, Any] = json.loads(text)
+    """What contracts/build.py wrote."""
+    loaded: dict[str, Any] = json.loads((resources.files(__package__) / "artifact/RobotLedger.json").read_text("utf-8"))
     return loaded
 
 
-def bytecode() -> bytes:
-    """What is sent to create the contract."""
-    return bytes.fromhex(artifact()["bytecode"])
+class Ledger:
+    """The contract at an address, on a node. Made by `connect` or `deploy`; asks nothing until it is used."""
+
+    def __init__(self, where: Any, contract: str, *, timeout: float = 10.0) -> None:
+        """where: a URL, or a provider of web3 (nodes.embedded). timeout: seconds for one answer."""
+        from web3 import HTTPProvider, Web3
+        from web3.middleware import ExtraDataToPOAMiddleware
+
+        if isinstance(where, str):
+            self.url = shown(where)
+            options = {"timeout": timeout, "allow_redirects": False}
+            where = HTTPProvider(where, options, session(), exception_retry_configuration=None)
+        else:
+            self.url = "embedded"
+        where.global_ccip_read_enabled = False  # EIP-3668: a node's error would have us fetch any URL it names
+        # The default middleware asks for the chain id before every call, and wraps every answer.
+        self.w3 = Web3(where, middleware=[ExtraDataToPOAMiddleware])
+        with self._asking():
+            self.contract: str = Web3.to_checksum_address(contract)
+        self._contract: Any = self.w3.eth.contract(address=self.w3.to_checksum_address(contract), abi=artifact()["abi"])
+
+    @staticmethod
+    def connect(where: Any, contract: str, *, timeout: float = 10.0) -> Ledger:
+        """The contract at `contract`, on the node at `where`; http and https."""
+        return Ledger(where, contract, timeout=timeout)
+
+    @staticmethod
+    def deploy(where: Any, operator: LocalAccount, *, wait: float = 120.0) -> Ledger:
+        """Create the contract; `operator` pays and becomes its operator. Waits until a block holds it."""
+        nowhere = Ledger(where, "0x" + "00" * 20)
+        receipt = nowhere._send_and_wait(operator, None, bytes.fromhex(artifact()["bytecode"]), 0, 2_500_000, wait)
+        if receipt.contract is None:
+            raise ChainError(f"{nowhere.url} mined the deployment but names no contract address")
+        return Ledger(where, receipt.contract)
+
+    def close(self) -> None:
+        with self._asking():
+            manager = getattr(self.w3.provider, "_request_session_manager", None)
+            if manager is not None:
+                manager._explicit_session.close()
+
+    # ------------------------------------------------------------------ the chain
+
+    @cached_property
+    def chain_id(self) -> int:
+        with self._asking():
+            return _natural(self.w3.eth.chain_id)
+
+    @cached_property
+    def genesis(self) -> bytes:
+        """The hash of block 0."""
+        return self.block(0).hash
+
+    @property
+    def ledger(self) -> bytes:
+        """What a robot's signatures name this contract on this chain by."""
+        return ledger_id(self.chain_id, self.genesis, bytes.fromhex(self.contract[2:]))
+
+    def require(self, chain_id: int, genesis: bytes) -> None:
+        """ChainError unless the node is of this chain and has the contract."""
+        if (self.chain_id, self.genesis) != (chain_id, genesis):
+            raise ChainError(
+                f"{self.url} is another chain: id {self.chain_id} and first block {self.genesis.hex()[:16]}, "
+                f"expected {chain_id} and {genesis.hex()[:16]}; name a node of the chain that was set up"
+            )
+        with self._asking():
+            code = bytes(self.w3.eth.get_code(self._contract.address))
+        if not code:
+            raise ChainError(f"there is no contract at {self.contract} on {self.url}; is the node behind?")
+
+    def block(self, number: int | str = "latest") -> Block:
+        with self._asking():
+            got: Any = self.w3.eth.get_block(number)  # type: ignore[arg-type]
+            fee = got.get("baseFeePerGas")
+            found = Block(
+                _natural(got["number"]),
+                _natural(got["timestamp"]),
+                _bytes32(got["hash"]),
+                _natural(got["gasLimit"]),
+                None if fee is None else _natural(fee, 2**128),
+            )
+            if number not in ("latest", found.number):
+                raise ValueError(f"block {found.number} in place of block {number}")
+            return found
+
+    def block_number(self) -> int:
+        with self._asking():
+            return _natural(self.w3.eth.block_number)
+
+    def block_time(self, number: int) -> int:
+        """UTC seconds."""
+        return self.block(number).time
+
+    def balance(self, account: str) -> int:
+        with self._asking():
+            return _natural(self.w3.eth.get_balance(self.w3.to_checksum_address(account)), 2**256)
+
+    def nonces(self, accounts: Sequence[str]) -> list[tuple[int, int]]:
+        """For each account how many transactions are in blocks, and how many with those that wait in the pool."""
+        asked = [("eth_getTransactionCount", [a, tag]) for a in accounts for tag in ("latest", "pending")]
+        answers = self._many(asked)
+        with self._asking():
+            counts = [_natural(_required(answer)) for answer in answers]
+        return list(zip(counts[::2], counts[1::2], strict=True))
+
+    def fees(self, head: Block) -> Fees:
+        """Enough for six full blocks in a row: the base fee rises by at most 1/8 a block, and 1.125**6 > 2."""
+        with self._asking():
+            if head.base_fee is None:
+                return Fees(_natural(self.w3.eth.gas_price, 2**128), None)
+            tip = _natural(self.w3.eth.max_priority_fee, 2**128)
+            return Fees(2 * head.base_fee + tip, tip)
+
+    # ------------------------------------------------------------------ what the contract says
+
+    def standings(self, tks: Sequence[bytes], block: int | str = "latest") -> list[Standing]:
+        """How these robots stand, as of a block; in the order asked."""
+        found: list[Standing] = []
+        for start in range(0, len(tks), PAGE):
+            page = tks[start : start + PAGE]
+            answer = self._read("standings", list(page), block=block)
+            with self._asking():
+                rows = [_standing(*row) for row in answer]
+                if len(rows) != len(page):
+                    raise ValueError(f"{len(rows)} standings for {len(page)} robots")
+            found += rows
+        return found
+
+    def check_data(self, tk: bytes, first: int, hashes: Sequence[bytes], index: int, chunk: bytes) -> bool:
+        """CheckData: is this the chunk at `index` of the batch that begins with number `first`?"""
+        return bool(self._read("checkData", tk, first, list(hashes), index, chunk))
+
+    def operator(self) -> str:
+        return str(self._read("operator"))
+
+    def _read(self, function: str, *arguments: Any, block: int | str = "latest") -> Any:
+        with self._asking():
+            return self._contract.functions[function](*arguments).call(block_identifier=block)
+
+    # ------------------------------------------------------------------ events
+
+    def data_events(self, tk: bytes, first_block: int, last_block: int) -> Iterator[DataEvent]:
+        """The robot's batches in these blocks, oldest first; asked for in ranges, halved where they are refused."""
+        span, start = SPAN, first_block
+        while start <= last_block:
+            end = min(start + span - 1, last_block)
+            try:
+                found = self._data(tk, start, end)
+            except TooMuch:
+                if span == 1:
+                    raise
+                span //= 2
+                continue
+            yield from found
+            start, span = end + 1, min(2 * span, SPAN)
+
+    def newest_data(self, tk: bytes, last_block: int) -> Iterator[DataEvent]:
+        """The robot's batches from `last_block` back, newest first, by their links; `last_block` holds one.
+
+        ChainError where a link leads to a block without one.
+        """
+        block = last_block
+        while block > 0:
+            found = self._data(tk, block, block)
+            if not found:
+                raise ChainError(f"{self.url} has no batch of this robot in block {block}, where there must be one")
+            yield from reversed(found)
+            previous = found[0].previous_block
+            if previous >= block:
+                raise ChainError(f"{self.url}: the batch before that of block {block} is said to be in {previous}")
+            block = previous
+
+    def registrations(self, tk: bytes, standing: Standing) -> list[RegistrationEvent]:
+        """All of the robot's registrations and revocations up to `standing`, oldest first, by their links."""
+        found: list[RegistrationEvent] = []
+        block = standing.changed_block
+        while block > 0:
+            page = [_registration(*event) for event in self._events(("Registered", "Revoked"), tk, block, block)]
+            if not page or page[0].previous_block >= block:
+                raise ChainError(f"{self.url} has no registration of this robot in block {block}, where one must be")
+            found = page + found
+            block = page[0].previous_block
+        return found
+
+    def _data(self, tk: bytes, start: int, end: int) -> list[DataEvent]:
+        return [_data_event(*event) for event in self._events(("Data",), tk, start, end)]
+
+    def _events(
+        self, names: Sequence[str], tk: bytes, start: int, end: int
+    ) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+        """(name, arguments, log) of the robot's events of these names in these blocks, in their order."""
+        events = {_bytes32(self._contract.events[name]().topic): self._contract.events[name]() for name in names}
+        with self._asking():
+            logs: Any = self.w3.eth.get_logs(
+                {
+                    "address": self._contract.address,
+                    "topics": [["0x" + topic.hex() for topic in events], "0x" + tk.hex()],  # type: ignore[list-item]
+                    "fromBlock": start,
+                    "toBlock": end,
+                }
+            )
+            found = []
+            for log in sorted(logs, key=lambda log: (log["blockNumber"], log["logIndex"])):
+                event = events[_bytes32(log["topics"][0])].process_log(log)
+                right = log["address"] == self._contract.address and start <= log["blockNumber"] <= end
+                if not right or event["args"]["Tk"] != tk:
+                    raise ValueError("an event that was not asked for")
+                found.append((event["event"], event["args"], log))
+            return found
+
+    # ------------------------------------------------------------------ transactions
+
+    def calldata(self, function: str, *arguments: Any) -> bytes:
+        return bytes.fromhex(self._contract.encode_abi(function, args=arguments)[2:])
+
+    def sign(self, account: LocalAccount, data: bytes, *, nonce: int, gas: int, fees: Fees, value: int = 0) -> Signed:
+        """A transaction to the contract, for the chain whose id this node first gave."""
+        return self._sign(account, self.contract, data, nonce, gas, fees, value)
+
+    def send(self, raws: Sequence[bytes]) -> list[ChainError | None]:
+        """Hand signed transactions to the node; for each None, or why it was refused."""
+        answers = self._many([("eth_sendRawTransaction", ["0x" + raw.hex()]) for raw in raws])
+        return [answer if isinstance(answer, ChainError) else None for answer in answers]
+
+    def call(self, account: str, data: bytes, *, value: int = 0, gas: int | None = None) -> None:
+        """Try a transaction without sending it; Reverted with the contract's error if it would fail."""
+        transaction: Any = {"from": account, "to": self._contract.address, "data": "0x" + data.hex(), "value": value}
+        with self._asking():
+            self.w3.eth.call(transaction | ({} if gas is None else {"gas": gas}))
+
+    def receipt(self, transaction: bytes) -> Receipt | None:
+        """The outcome of a transaction that is in a block."""
+        from web3.exceptions import TransactionNotFound
+
+        with self._asking():
+            try:
+                got: Any = self.w3.eth.get_transaction_receipt("0x" + transaction.hex())  # type: ignore[arg-type]
+            except TransactionNotFound:
+                return None
+            if got.get("blockNumber") is None:
+                return None
+            return Receipt(
+                transaction, _natural(got["blockNumber"]), got["status"] == 1, _natural(got["gasUsed"]),
+                got.get("contractAddress"),
+            )
+
+    def transact(
+        self, account: LocalAccount, function: str, *arguments: Any, value: int = 0, wait: float = 120.0
+    ) -> Receipt:
+        """Send one call and wait until a block holds it; Reverted, at no cost, if the contract would refuse it."""
+        data = self.calldata(function, *arguments)
+        gas = set_data_gas([len(chunk) for chunk in arguments[-1]]) if function == "setData" else call_gas(data)
+        self.call(account.address, data, value=value, gas=gas)
+        return self._send_and_wait(account, self.contract, data, value, gas, wait)
+
+    def set_data(self, account: LocalAccount, tk: bytes, chunks: Sequence[bytes]) -> Receipt:
+        """SetData: write these chunks behind what is there, and wait. The submitter does it without waiting."""
+        [standing] = self.standings([tk])
+        return self.transact(account, "setData", tk, standing.chunks, standing.tail, list(chunks))
+
+    def registration(self, operator: LocalAccount, tk: bytes, account: str, certificates: bytes) -> Receipt:
+        return self.transact(operator, "registration", tk, account, certificates)
+
+    def replace_registration(self, operator: LocalAccount, tk: bytes, account: str, certificates: bytes) -> Receipt:
+        return self.transact(operator, "replaceRegistration", tk, account, certificates)
+
+    def revoke_robot(self, operator: LocalAccount, tk: bytes) -> Receipt:
+        return self.transact(operator, "revokeRobot", tk)
+
+    def alloc_eth(self, operator: LocalAccount, account: str, wei: int) -> Receipt:
+        """AllocETH: to a registered robot's account, up to BALANCE_LIMIT."""
+        return self.transact(operator, "allocETH", account, value=wei)
+
+    def offer_operator(self, operator: LocalAccount, account: str) -> Receipt:
+        return self.transact(operator, "offerOperator", account)
+
+    def accept_operator(self, account: LocalAccount) -> Receipt:
+        return self.transact(account, "acceptOperator")
+
+    def _sign(
+        self, account: LocalAccount, to: str | None, data: bytes, nonce: int, gas: int, fees: Fees, value: int
+    ) -> Signed:
+        fields: dict[str, Any] = {"chainId": self.chain_id, "nonce": nonce, "gas": gas, "value": value, "data": data}
+        if to is not None:
+            fields["to"] = to
+        if fees.tip is None:
+            fields["gasPrice"] = fees.highest
+        else:
+            fields |= {"type": 2, "maxFeePerGas": fees.highest, "maxPriorityFeePerGas": fees.tip}
+        signed = account.sign_transaction(fields)
+        return Signed(bytes(signed.raw_transaction), bytes(signed.hash))
+
+    def _send_and_wait(
+        self, account: LocalAccount, to: str | None, data: bytes, value: int, gas: int, wait: float
+    ) -> Receipt:
+        """Behind what the account has in the pool; again with the next number if another transaction took its own."""
+        deadline, signed, nonce, pause = time.monotonic() + wait, None, 0, 0.02
+        while time.monotonic() < deadline:
+            if signed is None:
+                [(_, nonce)] = self.nonces([account.address])
+                signed = self._sign(account, to, data, nonce, gas, self.fees(self.block()), value)
+                [error] = self.send([signed.raw])
+                if isinstance(error, NonceTooLow | Underpriced):
+                    signed = None  # somebody else was faster
+                elif error is not None and not isinstance(error, AlreadyKnown):
+                    raise error
+            elif (receipt := self.receipt(signed.hash)) is not None:
+                if not receipt.succeeded:
+                    raise Reverted(f"transaction 0x{signed.hash.hex()} failed in block {receipt.block}")
+                return receipt
+            elif self.nonces([account.address])[0][0] > nonce and self.receipt(signed.hash) is None:
+                signed = None
+            time.sleep(pause)
+            pause = min(2 * pause, 1.0)
+        raise ChainError(
+            f"{self.url} took the transaction, but no block holds it after {wait:.0f} s; "
+            "look whether the chain makes blocks and whether the fee is enough, then look again"
+        )
+
+    # ------------------------------------------------------------------ requests
+
+    def _many(self, requests: Sequence[tuple[str, list[Any]]]) -> list[Any]:
+        """The answers to many requests in few HTTP requests; a ChainError in the place of one that was refused."""
+        provider: Any = self.w3.provider
+        answers: list[Any] = []
+        for page in _pages(requests):
+            with self._asking():
+                got = provider.make_batch_request(page)
+                if not isinstance(got, list) or len(got) != len(page):
+                    raise self._error(got.get("error", "no batches") if isinstance(got, dict) else "a wrong count")
+                answers += [self._error(answer["error"]) if "error" in answer else answer["result"] for answer in got]
+        return answers
+
+    @contextmanager
+    def _asking(self) -> Iterator[None]:
+        """What web3, requests or our own checks make of a node's answer becomes a ChainError."""
+        import requests
+        from web3.exceptions import ContractLogicError, Web3Exception, Web3RPCError
+
+        try:
+            yield
+        except ChainError:
+            raise
+        except ContractLogicError as error:
+            raise self._error({"message": "execution reverted: " + str(error.message), "data": error.data}) from error
+        except Web3RPCError as error:
+            raise self._error((error.rpc_response or {}).get("error", str(error))) from error
+        except requests.RequestException as error:
+            raise ChainUnavailable(f"{self.url} does not answer: {_reason(error)}") from error
+        except (Web3Exception, OSError, *_FORM) as error:
+            raise ChainUnavailable(
+                f"{self.url} gave an answer that cannot be used: {printable(error) or type(error).__name__}"
+            ) from error
+
+    def _error(self, error: Any) -> ChainError:
+        """The error object of a JSON-RPC answer."""
+        message, data = (error.get("message"), error.get("data")) if isinstance(error, dict) else (error, None)
+        found = classify(message)
+        if isinstance(found, Reverted):
+            return self._revert(data) or Reverted(f"the contract refuses: {printable(message)}")
+        return type(found)(f"{self.url}: {found}")
+
+    def _revert(self, data: Any) -> Reverted | None:
+        """The contract's own error, where `data` holds one."""
+        from eth_abi import decode
+        from eth_abi.exceptions import DecodingError
+        from web3 import Web3
+
+        if isinstance(data, dict):
+            data = data.get("data")
+        try:
+            code = bytes.fromhex(str(data).removeprefix("Reverted ").removeprefix("0x"))
+            for item in artifact()["abi"]:
+                types = [entry["type"] for entry in item.get("inputs", ())]
+                if item["type"] == "error" and Web3.keccak(text=f"{item['name']}({','.join(types)})")[:4] == code[:4]:
+                    values = decode(types, code[4:])
+                    named = zip((entry["name"] for entry in item["inputs"]), values, strict=True)
+                    words = ", ".join(f"{n} 0x{v.hex()}" if isinstance(v, bytes) else f"{n} {v}" for n, v in named)
+                    return Reverted(f"the contract refuses: {item['name']}({words})", item["name"], values)
+        except (DecodingError, ValueError):
+            pass
+        return None
 
 
-def runtime_code() -> bytes:
-    """What lies at the contract's address."""
-    return bytes.fromhex(artifact()["deployedBytecode"])
+# ---------------------------------------------------------------------- forms of answers
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """A function, event or error of the ABI."""
-
-    name: str
-    id: bytes  # selector (4 bytes) or topic (32)
-    inputs: tuple[tuple[str, str, bool], ...]  # name, type, indexed
-    outputs: tuple[str, ...]
+def _natural(value: Any, end: int = 2**63) -> int:
+    number = int(value, 16) if isinstance(value, str) else value
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < end:
+        raise ValueError(f"{printable(value, 40)} where a number was expected")
+    return number
 
 
-@cache
-def _entries(kind: str) -> dict[str, _Entry]:
-    found = {}
-    for item in artifact()["abi"]:
-        if item["type"] == kind:
-            inputs = tuple((i["name"], i["type"], i.get("indexed", False)) for i in item["inputs"])
-            id = keccak(f"{item['name']}({','.join(type for _, type, _ in inputs)})".encode())
-            outputs = tuple(o["type"] for o in item.get("outputs", ()))
-            found[item["name"]] = _Entry(item["name"], id if kind == "event" else id[:4], inputs, outputs)
+def _bytes32(value: Any) -> bytes:
+    found = bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
+    if len(found) != 32:
+        raise ValueError(f"{len(found)} bytes where 32 were expected")
     return found
 
 
-def calldata(function: str, *arguments: object) -> bytes:
-    """The data of a transaction that calls `function`."""
-    from eth_abi.abi import encode
-
-    entry = _entries("function")[function]
-    return entry.id + encode([type for _, type, _ in entry.inputs], arguments)
-
-
-def explain(failure: NodeFailure) -> NodeFailure:
-    """A Reverted with the contract's own error named; any other failure unchanged."""
-    from eth_abi.abi import decode
-    from eth_abi.exceptions import DecodingError
-
-    if not isinstance(failure, Reverted) or failure.name or len(failure.data) < 4:
-        return failure
-    for entry in _entries("error").values():
-        if entry.id == failure.data[:4]:
-            try:
-                values = decode([type for _, type, _ in entry.inputs], failure.data[4:])
-            except DecodingError:
-                return failure
-            words = ", ".join(f"{name} {_readable(v)}" for (name, _, _), v in zip(entry.inputs, values, strict=True))
-            return Reverted(f"the contract refused: {entry.name}({words})", failure.data, entry.name, tuple(values))
-    return failure
-
-
-def _readable(value: object) -> str:
-    return "0x" + value.hex() if isinstance(value, bytes) else str(value)
-
-
-# ---------------------------------------------------------------------- events
-
-
-@dataclass(frozen=True, slots=True)
-class Registered:
-    """A robot was bound to an account. `certificates`: whatever the operator put there."""
-
-    robot: bytes
-    account: str
-    generation: int
-    previous_block: int
-    certificates: bytes = field(repr=False)
-    log: Log = field(repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Revoked:
-    """A robot's account may not write any more."""
-
-    robot: bytes
-    account: str
-    generation: int
-    previous_block: int
-    log: Log = field(repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class BatchRecorded:
-    """A batch was written, the robot's `number`-th (from 1). `records` are packed (see packing)."""
-
-    robot: bytes
-    batch_index: int
-    account: str
-    root: bytes
-    number: int
-    previous_block: int
-    records: bytes = field(repr=False)
-    log: Log = field(repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class ETHAllocated:
-    """A robot's account was topped up by `amount` wei."""
-
-    robot: bytes
-    account: str
-    amount: int
-    log: Log = field(repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class OperatorOffered:
-    operator: str
-    offered: str
-    log: Log = field(repr=False)
-
-
-@dataclass(frozen=True, slots=True)
-class OperatorChanged:
-    previous: str
-    operator: str
-    log: Log = field(repr=False)
-
-
-Event: TypeAlias = Registered | Revoked | BatchRecorded | ETHAllocated | OperatorOffered | OperatorChanged
-_EVENTS: dict[str, Callable[..., Event]] = {
-    "Registered": Registered,
-    "Revoked": Revoked,
-    "Batch": BatchRecorded,
-    "ETHAllocated": ETHAllocated,
-    "OperatorOffered": OperatorOffered,
-    "OperatorChanged": OperatorChanged,
-}
-
-
-def topic(event: str) -> bytes:
-    """Topic 0 of an event."""
-    return _entries("event")[event].id
-
-
-def decode_event(log: Log) -> Event:
-    """The event a log stands for; VerificationError if it is none of the contract's or is malformed."""
-    from eth_abi.abi import decode
-    from eth_abi.exceptions import DecodingError
-
-    for name, entry in _entries("event").items():
-        if log.topics[:1] != (entry.id,):
-            continue
-        plain = [type for _, type, indexed in entry.inputs if not indexed]
-        try:
-            topics = iter([decode([t], v)[0] for t, v in zip(_indexed(entry), log.topics[1:], strict=True)])
-            data = iter(decode(plain, log.data))
-        except (DecodingError, ValueError) as error:
-            raise VerificationError(f"a {name} event of block {log.block_number} is malformed: {error}") from error
-        values = [next(topics) if indexed else next(data) for _, _, indexed in entry.inputs]
-        return _EVENTS[name](*(_checksummed(v, t) for v, (_, t, _) in zip(values, entry.inputs, strict=True)), log)
-    raise VerificationError(f"a log of block {log.block_number} is no event of the contract")
-
-
-def _indexed(entry: _Entry) -> list[str]:
-    return [type for _, type, indexed in entry.inputs if indexed]
-
-
-def _checksummed(value: Any, type: str) -> Any:
-    from eth_utils.address import to_checksum_address
-
-    return to_checksum_address(value) if type == "address" else value
-
-
-# ---------------------------------------------------------------------- the contract on a chain
-
-
-@dataclass(frozen=True, slots=True)
-class RobotState:
-    """What the contract knows of a robot now. Block numbers are 0 where there is none."""
-
-    account: str
-    revoked: bool
-    batches: int
-    batch_block: int
-    registered_at: int
-    revoked_at: int
-    changed_at: int
-    generation: int
-    certificates_hash: bytes
-
-    @property
-    def registered(self) -> bool:
-        """Was it ever?"""
-        return self.generation > 0
-
-    @property
-    def may_write(self) -> bool:
-        return self.registered and not self.revoked
-
-
-@dataclass(frozen=True, slots=True)
-class Contract:
-    """The ledger at an address of a chain; made by `at` or `deploy`."""
-
-    chain: Chain
-    address: str
-
-    @staticmethod
-    def at(chain: Chain, address: str) -> Contract:
-        """The contract at `address`; ChainError if there is none or another one."""
-        from eth_utils.address import is_address, to_checksum_address
-
-        if not is_address(address):
-            raise ChainError(f"{address!r} is not an Ethereum address (0x and 40 hexadecimal digits)")
-        address = to_checksum_address(address)
-        code = chain.code(address)
-        if not code:
-            raise ChainError(
-                f"there is no contract at {address} on chain {chain.chain_id()} ({chain.url});"
-                " check the address and the node, or deploy the contract there"
-            )
-        if code != runtime_code():
-            raise ChainError(
-                f"the contract at {address} is not the RobotLedger of this version;"
-                " use the version it was deployed with, or deploy it anew"
-            )
-        return Contract(chain, address)
-
-    @property
-    def code_hash(self) -> bytes:
-        return keccak(runtime_code())
-
-    # ---- reading
-
-    def operator(self, block: int | None = None) -> str:
-        return str(_checksummed(self._read("operator", block=block)[0], "address"))
-
-    def robot(self, robot: bytes, block: int | None = None) -> RobotState:
-        account, *rest = self._read("robots", robot, block=block)
-        return RobotState(_checksummed(account, "address"), *rest)
-
-    def robot_of(self, account: str) -> bytes:
-        """Tk an account was ever bound to; 32 zero bytes if to none."""
-        return bytes(self._read("robotOf", account)[0])
-
-    def root(self, robot: bytes, batch_index: int, block: int | None = None) -> bytes:
-        """Merkle root of a batch; 32 zero bytes if the index is free."""
-        return bytes(self._read("root", robot, batch_index, block=block)[0])
-
-    def merkle_root(self, robot: bytes, packed: bytes) -> bytes:
-        """What the contract makes of packed records; Reverted (MalformedRecords) if it cannot read them."""
-        return bytes(self._read("merkleRoot", robot, packed)[0])
-
-    def check_data(
-        self,
-        record: SealedRecord,
-        batch_index: int,
-        leaf: int,
-        leaves: int,
-        proof: Sequence[bytes],
-        block: int | None = None,
-    ) -> bool:
-        """The contract's own answer whether the record is recorded; Reverted for a name never registered."""
-        id = record.id
-        arguments = (id.robot, batch_index, id.stream, id.seq, record.ciphertext, leaf, leaves, list(proof))
-        return bool(self._read("checkData", *arguments, block=block)[0])
-
-    def _read(self, function: str, *arguments: object, block: int | None = None) -> tuple[Any, ...]:
-        from eth_abi.abi import decode
-        from eth_abi.exceptions import DecodingError
-
-        try:
-            answer = self.chain.call(Call(self.address, calldata(function, *arguments)), block)
-        except NodeFailure as failure:
-            raise explain(failure) from failure
-        try:
-            return tuple(decode(_entries("function")[function].outputs, answer))
-        except DecodingError as error:
-            raise ChainError(f"{self.chain.url} answered {function} with {len(answer)} bytes it cannot mean") from error
-
-    # ---- writing, for people; the submitter writes batches
-
-    def transact(
-        self, account: LocalAccount, function: str, *arguments: object, value: int = 0, timeout: float = 120
-    ) -> Receipt:
-        """Send one transaction and wait until it is mined; the contract's error if it refuses."""
-        return send_and_wait(self.chain, account, self.address, calldata(function, *arguments), value, timeout)
-
-
-def deploy(chain: Chain, operator: LocalAccount, timeout: float = 120) -> Contract:
-    """Create the contract; `operator` pays and becomes its operator."""
-    receipt = send_and_wait(chain, operator, None, bytecode(), 0, timeout)
-    if receipt.contract is None:
-        raise ChainError(f"{chain.url} mined the deployment but names no contract address")
-    return Contract.at(chain, receipt.contract)
-
-
-def send_and_wait(
-    chain: Chain, account: LocalAccount, to: str | None, data: bytes, value: int, timeout: float
-) -> Receipt:
-    """Estimate, sign, send and wait for the receipt; polls until `timeout` seconds have passed."""
-    try:
-        gas = chain.estimate_gas(Call(to, data, account.address, value)) * (100 + GAS_MARGIN_PERCENT) // 100
-    except NodeFailure as failure:
-        raise explain(failure) from failure
-    fees = Fees.suggested(chain.head(), chain.priority_fee())
-    nonce = chain.nonce(account.address)
-    signed = sign(Transaction(chain.chain_id(), nonce, to, data, gas, fees, value), account)
-    answer = chain.send([signed.raw])[0]
-    if isinstance(answer, NodeFailure):
+def _required(answer: Any) -> Any:
+    if isinstance(answer, ChainError):
         raise answer
-    deadline, pause = time.monotonic() + timeout, 0.02
-    while (receipt := chain.receipts([signed.hash])[0]) is None:
-        if time.monotonic() > deadline:
-            raise ChainError(
-                f"transaction 0x{signed.hash.hex()} was accepted by {chain.url} but is in no block after"
-                f" {timeout:.0f} s; look whether the chain is mining, then ask for its state again"
-            )
-        time.sleep(pause)
-        pause = min(2 * pause, 1.0)
-    if not receipt.succeeded:
-        raise Reverted(f"transaction 0x{signed.hash.hex()} reverted in block {receipt.block_number}")
-    return receipt
+    return answer
+
+
+def _standing(
+    account: str, certificates_hash: bytes, revoked: bool, chunks: int, tail: bytes, balance: int,
+    data_block: int, changed_block: int,
+) -> Standing:
+    numbers = (_natural(chunks), tail, balance, _natural(data_block), _natural(changed_block))
+    return Standing(account if int(account, 16) else None, certificates_hash, revoked, *numbers)
+
+
+def _data_event(_: str, args: dict[str, Any], log: dict[str, Any]) -> DataEvent:
+    return DataEvent(
+        args["first"], args["previousBlock"], tuple(args["chunks"]), log["blockNumber"],
+        bytes(log["transactionHash"]), args["account"],
+    )  # fmt: skip
+
+
+def _registration(name: str, args: dict[str, Any], log: dict[str, Any]) -> RegistrationEvent:
+    return RegistrationEvent(
+        args["account"], args.get("certificates", b""), args["index"], args["previousBlock"], log["blockNumber"],
+        name == "Revoked",
+    )  # fmt: skip
+
+
+def _pages(requests: Sequence[tuple[str, list[Any]]]) -> Iterator[list[tuple[Any, list[Any]]]]:
+    page: list[tuple[str, list[Any]]] = []
+    size = 0
+    for request in requests:
+        weight = len(str(request[1][0]))
+        if page and (len(page) == BATCH or size + weight > BATCH_BYTES):
+            yield page
+            page, size = [], 0
+        page.append(request)
+        size += weight
+    if page:
+        yield page
+
+
+def _reason(error: Exception) -> str:
+    """Why there was no answer, in few words: requests' own repeat the address and an object's repr."""
+    import requests
+
+    if isinstance(error, requests.Timeout):
+        return "too slow"
+    if isinstance(error, requests.HTTPError) and error.response is not None:
+        return f"HTTP {error.response.status_code} {printable(error.response.reason, 60)}".strip()
+    words = printable(error, 1000)
+    return words.rsplit(": ", 1)[-1].rstrip("')\"") if ": " in words else words

@@ -1,0 +1,197 @@
+"""HTTP to a node that may be slow, broken or hostile; and what went wrong, sorted by what the caller can do about it.
+
+requests has a timeout for each read and none for an answer, and takes bodies of
+any size. The adapter here gives every answer a deadline and a limit, and hands
+the JSON error of an HTTP 4xx or 5xx to web3, which would show the status alone.
+
+Nodes say the same thing in different words, mostly under one code (-32000).
+TABLE is matched in order, without regard to case. Where the words are from:
+
+    geth     core/txpool/errors.go, core/error.go, core/vm/errors.go
+    anvil    crates/anvil/core, crates/anvil/src/eth/error.rs (Foundry)
+    others   Nethermind's AcceptTxResult, Besu's RpcErrorType, Erigon's txpoolcfg
+    py-evm   eth/validation.py, eth/vm/base.py
+"""
+
+from __future__ import annotations
+
+import functools
+import http.client
+import io
+import re
+import socket
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+import requests
+from requests.adapters import HTTPAdapter
+from urllib3.connection import HTTPConnection, HTTPSConnection
+from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
+
+from rosbridge_eth.errors import ChainError
+
+MAX_ANSWER = 64 * 2**20  # bytes; the events of a full block are a tenth of it
+_PIECE = 64 * 1024
+
+
+class ChainUnavailable(ChainError):
+    """No answer, a refusal, or an answer that cannot be used. The same request may succeed later."""
+
+
+class TooMuch(ChainUnavailable):
+    """The node, or the limit here, wants events asked for in smaller pieces."""
+
+
+class AlreadyKnown(ChainError):
+    """The node has this very transaction: as good as accepted."""
+
+
+class NonceTooLow(ChainError):
+    """The account has gone past this nonce."""
+
+
+class Underpriced(ChainError):
+    """The fee is too low: for the node, for the next block, or to replace what has this nonce."""
+
+
+class OutOfFunds(ChainError):
+    """The account cannot pay for gas limit * fee + value."""
+
+
+class Reverted(ChainError):
+    """The contract refuses. `name` is its error, '' where it gave none; `arguments` are that error's values."""
+
+    def __init__(self, message: str, name: str = "", arguments: tuple[Any, ...] = ()) -> None:
+        super().__init__(message)
+        self.name = name
+        self.arguments = arguments
+
+
+TABLE: tuple[tuple[type[ChainError], str], ...] = (
+    (AlreadyKnown, r"already known|already imported|(?<!un)known transaction|alreadyknown|already exists"),
+    (NonceTooLow, r"nonce too low|nonce too old|oldnonce|nonce .*is lower than|invalid transaction nonce"),
+    (
+        Underpriced,
+        r"underpriced|fee too low|feetoolow|max fee per gas less than block base fee|lower than block's base fee|"
+        r"gas price too low|gas price below|max priority fee per gas higher|replacementnotallowed|tip .*too low",
+    ),
+    (OutOfFunds, r"insufficient ?(funds|balance)|upfront cost exceeds|not enough funds|sender.* account balance"),
+    (Reverted, r"revert"),
+    (
+        TooMuch,
+        r"block range|range too (wide|large)|range.*exceed|too many results|more than \d+ results|"
+        r"query returned more|response (size|too large)|log response",
+    ),
+)
+_PATTERNS = tuple((kind, re.compile(pattern, re.IGNORECASE | re.DOTALL)) for kind, pattern in TABLE)
+
+
+def classify(message: object) -> ChainError:
+    """The error that a node's words stand for."""
+    words = printable(message)
+    return next((kind(words) for kind, pattern in _PATTERNS if pattern.search(words)), ChainUnavailable(words))
+
+
+def printable(text: object, limit: int = 300) -> str:
+    """A stranger's words on one line, without control characters."""
+    return "".join(c if c.isprintable() else " " for c in str(text)[:limit]).strip()
+
+
+def shown(url: str) -> str:
+    """A node's address as people see it: without password and path, which may hold an access key."""
+    parts = urlsplit(url)
+    port = f":{parts.port}" if parts.port else ""
+    return f"{parts.scheme}://{parts.hostname}{port}"
+
+
+# ---------------------------------------------------------------------- deadline and limit
+
+
+class _Timed(io.RawIOBase):
+    """A socket's bytes until a moment of time.monotonic()."""
+
+    def __init__(self, raw: io.RawIOBase, sock: socket.socket, deadline: float) -> None:
+        self._raw, self._sock, self._deadline = raw, sock, deadline
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        left = self._deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("the answer took too long")
+        self._sock.settimeout(left)
+        return self._raw.readinto(buffer)
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _Response(http.client.HTTPResponse):
+    def __init__(self, deadline: float, sock: socket.socket, *args: Any, **options: Any) -> None:
+        super().__init__(sock, *args, **options)
+        raw: Any = self.fp
+        self.fp = io.BufferedReader(_Timed(raw.detach(), sock, deadline))
+
+
+class _DeadlineMixin:
+    """A connection whose timeout is that of a whole answer, from its first byte on."""
+
+    def getresponse(self) -> Any:
+        connection: Any = self
+        connection.response_class = functools.partial(_Response, time.monotonic() + connection.timeout)
+        return super().getresponse()  # type: ignore[misc]
+
+
+class _Connection(_DeadlineMixin, HTTPConnection):
+    pass
+
+
+class _TlsConnection(_DeadlineMixin, HTTPSConnection):
+    pass
+
+
+class _Pool(HTTPConnectionPool):
+    ConnectionCls = _Connection
+
+
+class _TlsPool(HTTPSConnectionPool):
+    ConnectionCls = _TlsConnection
+
+
+class BoundedAdapter(HTTPAdapter):
+    """Answers of at most `limit` bytes, unpacked; the deadline is the request's timeout."""
+
+    def __init__(self, limit: int = MAX_ANSWER) -> None:
+        self._limit = limit
+        super().__init__()
+
+    def init_poolmanager(self, *args: Any, **options: Any) -> None:
+        super().init_poolmanager(*args, **options)  # type: ignore[no-untyped-call]
+        self.poolmanager.pool_classes_by_scheme = {"http": _Pool, "https": _TlsPool}
+
+    def send(self, request: Any, *args: Any, **options: Any) -> requests.Response:
+        response = super().send(request, *args, **(options | {"stream": True}))
+        body = bytearray()
+        try:
+            for piece in response.iter_content(_PIECE):
+                body += piece
+                if len(body) > self._limit:
+                    raise TooMuch(f"an answer of more than {self._limit} bytes")
+        finally:
+            response.close()
+        response._content = bytes(body)
+        if response.status_code >= 400 and b'"jsonrpc"' in body:
+            response.status_code = 200
+        return response
+
+
+def session() -> requests.Session:
+    """A session for one node; every request of it is to be given a timeout."""
+    made = requests.Session()
+    adapter = BoundedAdapter()
+    made.mount("http://", adapter)
+    made.mount("https://", adapter)
+    return made
