@@ -1,8 +1,8 @@
-"""A decoded message of any type to a value JSON can hold, compiled once per type and selection.
+"""A decoded message of any type to a value that JSON can hold, compiled once per type and selection.
 
-The converters follow the field *definitions*, never the attributes of the
-message object (rosbags adds a member to empty messages and renames Python's
-keywords), and keep their order, so equal messages give equal JSON.
+What is compiled is one Python expression over the message object, written from the field *definitions* and in their
+order, never from the attributes of the object (rosbags adds a member to empty messages and renames Python's keywords);
+so equal messages give equal JSON. Definitions hold checked identifiers only, and these are all that is written out.
 
     in the definition             in the record
     bool                          true, false
@@ -15,9 +15,8 @@ keywords), and keep their order, so equal messages give equal JSON.
     a message                     object of its fields
     messages, strings, in arrays  list
 
-A field above the limit (1 KiB) becomes {"sm3": hex, "length": bytes}. Measured
-and hashed are: a string's UTF-8, an array of numbers as on the wire
-(little-endian), any other array as its JSON.
+A field above the limit (16 KiB) becomes {"sm3": hex, "length": bytes}. Measured and hashed are: a string's UTF-8, an
+array of numbers as on the wire (little-endian), any other array as its JSON.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from __future__ import annotations
 import difflib
 from base64 import b64encode
 from collections.abc import Callable
-from json import JSONEncoder
 from math import inf, isfinite
 from typing import Any, Final, Literal, TypeAlias
 
 import numpy
+import orjson
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
@@ -40,14 +39,10 @@ from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
 
 OversizePolicy: TypeAlias = Literal["digest", "refuse"]
-Converter: TypeAlias = Callable[[Any], Any]
 
-DEFAULT_LIMIT: Final = 1024
+DEFAULT_LIMIT: Final = 16 * 1024
 """Bytes of one field from which on its digest stands for it."""
 
-to_json: Final = JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
-
-_SECOND: Final = 10**9
 _BYTES: Final = frozenset({"uint8", "char", "byte"})
 NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
     f"{kind}{bits}": f"<{letter}{bits // 8}"
@@ -86,37 +81,23 @@ class Conversion:
         self.type_name = decoder.type_name
         self.digested = 0
         self.last_digested = ""
-        self.convert = self._message(self.type_name, selection, "")
+        self._names: dict[str, Any] = {"isfinite": isfinite, "_float": _float}  # of functions, in the expression
+        expression = self._message(self.type_name, selection, "m", "")
+        self.convert: Callable[[Any], dict[str, Any]] = eval(f"lambda m: {expression}", self._names)  # noqa: S307
 
-    # Each method compiles: it returns the function that will convert a value, or None where
-    # the value is already what JSON holds.
+    # Each method writes the expression for the value of a field, given the expression for the field itself.
 
-    def _message(self, type_name: str, selection: Selection, path: str) -> Converter:
+    def _message(self, type_name: str, selection: Selection, value: str, path: str) -> str:
         fields = self._fields[type_name]
         if not selection.everything:
             self._check_names(type_name, selection, path)
             fields = [field for field in fields if field[0] in selection.members]
-        members = [
-            (
-                name,
-                attribute_name(name),
-                self._value(
-                    description,
-                    EVERYTHING if selection.everything else selection.members[name],
-                    f"{path}.{name}" if path else name,
-                ),
-            )
-            for name, description in fields
-        ]
-
-        def convert(message: Any) -> dict[str, Any]:
-            data = {}
-            for name, attribute, converter in members:
-                value = getattr(message, attribute)
-                data[name] = value if converter is None else converter(value)
-            return data
-
-        return convert
+        members = []
+        for name, description in fields:
+            chosen = EVERYTHING if selection.everything else selection.members[name]
+            inner = self._value(description, chosen, f"{value}.{attribute_name(name)}", f"{path}.{name}".lstrip("."))
+            members.append(f'"{name}": {inner}')
+        return f"{{{', '.join(members)}}}"
 
     def _check_names(self, type_name: str, selection: Selection, path: str) -> None:
         if selection.each or selection.elements:
@@ -129,108 +110,104 @@ class Conversion:
                 where = f"field {path!r} of {self.type_name}" if path else self.type_name
                 raise ConfigError(f"{where} has no field {name!r}; {hint}")
 
-    def _value(self, description: FieldDesc, selection: Selection, path: str) -> Converter | None:
+    def _value(self, description: FieldDesc, selection: Selection, value: str, path: str) -> str:
         if description[0] == Nodetype.BASE:
             self._check_leaf(selection, path, f"a {description[1][0]}")
-            return self._scalar(description[1][0], path)
+            return self._scalar(description[1][0], value, path)
         if description[0] == Nodetype.NAME:
             if description[1] in (TIME, DURATION):
                 self._check_leaf(selection, path, "captured as one number, in nanoseconds")
-                return self._instant(description[1])
-            return self._message(description[1], selection, path)
+                return self._instant(description[1], value)
+            return self._message(description[1], selection, value, path)
         element = description[1][0]
         if selection.everything:
-            return self._array(element, path)
+            return self._array(element, EVERYTHING, value, path)
         if selection.members:
             raise ConfigError(f"field {path!r} of {self.type_name} is an array; write {path}[*] or {path}[0]")
         if selection.each is not None:
             if element[0] == Nodetype.BASE:
                 self._check_leaf(selection.each, f"{path}[*]", f"a {element[1][0]}")
-                return self._array(element, path)
-            return self._list(self._value(element, selection.each, f"{path}[*]"), path)
-        return self._elements(element, selection.elements, path)
+            return self._array(element, selection.each, value, path)
+        return self._elements(element, selection.elements, value, path)
 
     def _check_leaf(self, selection: Selection, path: str, what: str) -> None:
         if not selection.everything:
             raise ConfigError(f"field {path!r} of {self.type_name} is {what}: nothing can be selected in it")
 
-    def _scalar(self, base: str, path: str) -> Converter | None:
+    def _scalar(self, base: str, value: str, path: str) -> str:
         if base in ("float32", "float64"):
-            return _float
-        if base == "string":
-            return self._string(path)
+            return f"v if isfinite(v := {value}) else _float(v)"
+        if base == "string":  # a character is at most 4 bytes of UTF-8
+            return f"v if len(v := {value}) <= {self._limit // 4} else {self._call(self._string(path))}(v)"
         if base == "byte" and not self._ros1:
-            return lambda value: value & 0xFF  # rosbags reads it as signed
-        return None
+            return f"{value} & 0xFF"  # rosbags reads it as signed
+        return value
 
-    def _string(self, path: str) -> Converter:
-        limit, too_large = self._limit, self._too_large
+    def _instant(self, type_name: str, value: str) -> str:
+        if not self._ros1:
+            return f"{value}.sec * 1000000000 + {value}.nanosec"
+        if type_name == TIME:
+            # rosbags reads the seconds as signed; ROS 1 writes uint32 (its time ends in 2106).
+            return f"({value}.sec & 0xFFFFFFFF) * 1000000000 + {value}.nanosec"
+        # Both parts of a ROS 1 duration are int32, rosbags reads the second one as unsigned.
+        return f"{value}.sec * 1000000000 + ({value}.nanosec + 2**31) % 2**32 - 2**31"
 
+    def _array(self, element: FieldDesc, selection: Selection, value: str, path: str) -> str:
+        if element[0] == Nodetype.BASE and element[1][0] != "string":
+            return f"{self._call(self._numbers(element[1][0], path))}({value})"
+        item = self._call(None)  # a name that no array within this one has
+        inner = self._value(element, selection, item, f"{path}[*]")
+        return f"{self._call(self._list(path))}([{inner} for {item} in {value}])"
+
+    def _elements(self, element: FieldDesc, elements: dict[int, Selection], value: str, path: str) -> str:
+        """The chosen ones by index, as far as the array has them."""
+        item = self._call(None)
+        convert = {
+            index: eval(  # noqa: S307
+                f"lambda {item}: {self._value(element, selection, item, f'{path}[{index}]')}", self._names
+            )
+            for index, selection in sorted(elements.items())
+        }
+
+        def choose(array: Any) -> dict[str, Any]:
+            items = array.tolist() if isinstance(array, numpy.ndarray) else array
+            return {str(index): function(items[index]) for index, function in convert.items() if index < len(items)}
+
+        return f"{self._call(choose)}({value})"
+
+    def _call(self, function: Callable[..., Any] | None) -> str:
+        """A name for the function in the expression."""
+        name = f"_{len(self._names)}"
+        self._names[name] = function
+        return name
+
+    def _string(self, path: str) -> Callable[[str], Any]:
         def convert(value: str) -> Any:
-            if len(value) * 4 <= limit:  # a character is at most 4 bytes of UTF-8
-                return value
             encoded = value.encode()
-            return value if len(encoded) <= limit else too_large(path, encoded)
+            return value if len(encoded) <= self._limit else self._too_large(path, encoded)
 
         return convert
 
-    def _instant(self, type_name: str) -> Converter:
-        if not self._ros1:
-            return lambda value: value.sec * _SECOND + value.nanosec
-        if type_name == TIME:
-            # rosbags reads the seconds as signed; ROS 1 writes uint32 (its time ends in 2106).
-            return lambda value: (value.sec & 0xFFFFFFFF) * _SECOND + value.nanosec
-        # Both parts of a ROS 1 duration are int32, rosbags reads the second one as unsigned.
-        return lambda value: value.sec * _SECOND + ((value.nanosec + 2**31) % 2**32 - 2**31)
-
-    def _array(self, element: FieldDesc, path: str) -> Converter:
-        if element[0] == Nodetype.BASE and element[1][0] != "string":
-            return self._numbers(element[1][0], path)
-        return self._list(self._value(element, EVERYTHING, f"{path}[*]"), path)
-
-    def _numbers(self, base: str, path: str) -> Converter:
-        limit, too_large, wire = self._limit, self._too_large, numpy.dtype(NUMPY[base])
-        size, binary, real = wire.itemsize, base in _BYTES, base in ("float32", "float64")
+    def _numbers(self, base: str, path: str) -> Callable[[Any], Any]:
+        wire = numpy.dtype(NUMPY[base])
+        longest, binary, real = self._limit // wire.itemsize, base in _BYTES, base in ("float32", "float64")
 
         def convert(value: Any) -> Any:
-            if len(value) * size > limit:
-                return too_large(path, numpy.asarray(value, wire).tobytes())
+            if len(value) > longest:
+                return self._too_large(path, numpy.asarray(value, wire).tobytes())
             array = numpy.asarray(value)
             if binary:
                 return b64encode(array.tobytes() if array.itemsize == 1 else bytes(value)).decode("ascii")
             numbers = array.tolist()
-            if real and not numpy.isfinite(array).all():
-                return [_float(number) for number in numbers]
-            return numbers
+            # The sum of finite numbers may overflow, which costs a second look and no more.
+            return numbers if not real or isfinite(sum(numbers)) else [_float(number) for number in numbers]
 
         return convert
 
-    def _list(self, converter: Converter | None, path: str) -> Converter:
-        limit, too_large = self._limit, self._too_large
-
-        def convert(value: Any) -> Any:
-            items = list(value) if converter is None else [converter(item) for item in value]
-            if not items:
-                return items
-            encoded = to_json(items).encode()
-            return items if len(encoded) <= limit else too_large(path, encoded)
-
-        return convert
-
-    def _elements(self, element: FieldDesc, elements: dict[int, Selection], path: str) -> Converter:
-        chosen = [
-            (index, str(index), self._value(element, selection, f"{path}[{index}]"))
-            for index, selection in sorted(elements.items())
-        ]
-
-        def convert(value: Any) -> dict[str, Any]:
-            data = {}
-            for index, key, converter in chosen:
-                if index < len(value):
-                    item = value[index]
-                    item = item.item() if isinstance(item, numpy.generic) else item
-                    data[key] = item if converter is None else converter(item)
-            return data
+    def _list(self, path: str) -> Callable[[list[Any]], Any]:
+        def convert(items: list[Any]) -> Any:
+            encoded = orjson.dumps(items) if items else b""
+            return items if len(encoded) <= self._limit else self._too_large(path, encoded)
 
         return convert
 

@@ -1,29 +1,30 @@
 """Message definitions, read strictly: what rosbags compiles is only what passed here.
 
-rosbags turns a definition into Python source and executes it, once for the
-message class and once for each way of (de)serialising it. A definition comes
-from a publisher's connection header or from a bag, that is, from anyone. So the
-text is parsed here, by a grammar of one line, into rosbags' own tree, and the
-tree that is handed on holds nothing but names that match the grammar of ROS
-identifiers, built-in type names and bounded integers. Constants and default
-values, the only free text of the format, never reach it: they are not on the wire.
+rosbags turns a definition into Python source and executes it, once for the message class and once for each way of
+(de)serialising it; `conversion` does the same. A definition comes from a publisher's connection header, from a bag or
+from a log, that is, from anyone. So what is handed on is a tree that holds nothing but names that match the grammar of
+ROS identifiers, built-in type names and bounded integers. Constants and default values never reach it: they are not
+on the wire. They are kept in `text`, which is copied and not interpreted.
 
-Refused besides bad syntax: a type that is missing, contains itself or is nested
-too deeply (rosbags would recurse), a fixed array that unrolls into too much code,
-and arrays of elements that take no bytes (a count of 2**32 would cost no data).
+Refused besides bad syntax: a type that is missing, contains itself or is nested too deeply (rosbags would recurse), a
+type that doubles at every level, a fixed array that unrolls into too much code, arrays of elements that take no bytes
+(a count of 2**32 would cost no data), and a definition too long for a line of the log.
 
-The MSG format: wiki.ros.org/msg and "Interfaces" of the ROS 2 documentation.
-What is parsed from IDL (see idl) goes through the same checks.
+The MSG format (wiki.ros.org/msg, "Interfaces" of the ROS 2 documentation) is read here, by a grammar of one line:
+rosbags' parser refuses names that ROS 1 allows. IDL is read by rosbags, behind `idl`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import keyword
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, TypeAlias, cast
 
+import orjson
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Fielddefs, FieldDesc, NameDesc, Typesdict
 
@@ -34,9 +35,13 @@ Format: TypeAlias = Literal["msg", "idl"]
 
 MAX_TEXT = 256 * 1024
 """Characters of one definition with everything it refers to; moveit's largest have about 60,000."""
+MAX_KEPT = 48 * 1024
+"""Bytes of a definition without its comments: it has to fit into a line of the log."""
 MAX_TYPES = 256
 MAX_FIELDS = 1024
 """Fields of all types of one definition together; rosbags needs about a millisecond for each."""
+MAX_LEAVES = 8192
+"""Fields of one message with those of the messages in it, an array counting once."""
 MAX_DEPTH = 32
 MAX_NAME = 128
 MAX_UNROLLED = 1024
@@ -47,11 +52,13 @@ MAX_COUNT = 2**32 - 1
 
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"
+HEADER = "std_msgs/msg/Header"
 _BUILTIN: dict[str, Fielddefs] = {
     name: [("sec", (Nodetype.BASE, ("int32", 0))), ("nanosec", (Nodetype.BASE, ("uint32", 0)))]
     for name in (TIME, DURATION)
 }
-_SHORT_NAMES = {"time": TIME, "duration": DURATION, "Header": "std_msgs/msg/Header"}
+_SHORT_NAMES = {"time": TIME, "duration": DURATION, "Header": HEADER}
+_ROS1_NAMES = {TIME: "time", DURATION: "duration"}
 
 SIZES = {
     "bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
@@ -61,7 +68,7 @@ SIZES = {
 _BASES = SIZES.keys() | {"string"}
 _UNSUPPORTED = {"wstring", "wchar", "float128", "fixed"}
 EMPTY_MESSAGE_FIELD = "structure_needs_at_least_one_member"
-"""rosidl's name for the byte that stands for a message without fields."""
+"""rosidl's and rosbags' name for the byte that stands for a message without fields."""
 
 _SEPARATOR = "=" * 80
 _IDENTIFIER = r"[A-Za-z][A-Za-z0-9_]*"
@@ -89,17 +96,33 @@ class DefinitionError(SourceError):
 class Definition:
     """A message type with everything it refers to, in rosbags' tree form, checked.
 
-    fields: of each type name (`pkg/msg/Name`), in wire order, without constants.
+    fields: of each type name (`pkg/msg/Name`), parts before wholes, in wire order, without constants.
     smallest: bytes the shortest message of each type takes on the wire (ROS 1 form, no padding).
+    text: the same in the MSG format with sections: as it was read, without comments, where that was MSG.
     """
 
     type_name: str
     fields: Mapping[str, Fielddefs]
     smallest: Mapping[str, int]
+    text: str
 
     def typesdict(self) -> Typesdict:
         """The tree for rosbags' type store: no constants."""
         return {name: ([], list(fields)) for name, fields in self.fields.items()}
+
+    @cached_property
+    def md5(self) -> str:
+        """The sum by which ROS 1 tells definitions apart (wiki.ros.org/ROS/Technical Overview). DefinitionError.
+
+        Of a type: its constants, then its fields, one a line; a field of another message type has that type's sum in
+        place of its name. It says whether two parties mean the same layout, and protects against nobody.
+        """
+        texts = dict(_sections(self.type_name, self.text.splitlines()))
+        sums: dict[str, str] = {}
+        for name in self.fields:  # parts before wholes: nothing recurses
+            if name in texts:
+                sums[name] = _md5_of_one(name, texts[name], sums)
+        return sums[self.type_name]
 
 
 def normalised_type_name(name: str) -> str:
@@ -118,19 +141,23 @@ def normalised_type_name(name: str) -> str:
 def read_definition(type_name: str, text: str, format: Format = "msg") -> Definition:
     """Parse and check the definition of `type_name`, followed by those of the types it refers to.
 
-    text: as a ROS 1 connection header or an mcap schema has it: sections after
-    the first open with a line of 80 "=" and `MSG: pkg/Name`.
-    Raises DefinitionError.
+    text: as a ROS 1 connection header or an mcap schema has it: sections after the first open with a line of 80 "="
+    and `MSG: pkg/Name`. Raises DefinitionError.
     """
     name = normalised_type_name(type_name)
     if len(text) > MAX_TEXT:
         raise DefinitionError(f"the definition of {name} has {len(text)} characters; at most {MAX_TEXT} are read")
-    types = _parse_msg(name, text) if format == "msg" else _parse_idl(name, text)
-    return check_types(name, types)
+    if format == "idl":
+        return check_types(name, _parse_idl(name, text))
+    lines = [kept for line in text.splitlines() if (kept := _without_comment(line))]
+    return check_types(name, _parse_msg(name, lines), "\n".join(lines) + "\n")
 
 
-def check_types(type_name: str, types: Mapping[str, Fielddefs]) -> Definition:
-    """Check a tree, whoever parsed it, and keep of it what `type_name` refers to. Raises DefinitionError."""
+def check_types(type_name: str, types: Mapping[str, Fielddefs], text: str | None = None) -> Definition:
+    """Check a tree, whoever parsed it, and keep of it what `type_name` refers to. Raises DefinitionError.
+
+    text: what it was parsed from; without it, the text is written from the tree.
+    """
     if len(types) > MAX_TYPES:
         raise DefinitionError(f"the definition of {type_name} brings {len(types)} types; at most {MAX_TYPES}")
     if sum(len(fields) for fields in types.values()) > MAX_FIELDS:
@@ -140,7 +167,14 @@ def check_types(type_name: str, types: Mapping[str, Fielddefs]) -> Definition:
             raise DefinitionError(f"the definition of {type_name} redefines {name}")
     checker = _Checker({**types, **_BUILTIN})
     checker.visit(type_name, 0)
-    return Definition(type_name, checker.done, checker.smallest)
+    text = write_text(type_name, checker.done) if text is None else text
+    try:
+        length = len(orjson.dumps(text))
+    except orjson.JSONEncodeError:
+        raise DefinitionError(f"the definition of {type_name} is not text") from None
+    if length > MAX_KEPT:
+        raise DefinitionError(f"the definition of {type_name} is longer than {MAX_KEPT} bytes without its comments")
+    return Definition(type_name, checker.done, checker.smallest, text)
 
 
 class _Checker:
@@ -151,6 +185,7 @@ class _Checker:
         self.done: dict[str, Fielddefs] = {}
         self.smallest: dict[str, int] = {}
         self.unrolled = 0
+        self._leaves: dict[str, int] = {}
         self._open: set[str] = set()
 
     def visit(self, name: str, depth: int) -> int:
@@ -164,22 +199,25 @@ class _Checker:
         if depth > MAX_DEPTH:
             raise DefinitionError(f"message types are nested more than {MAX_DEPTH} deep at {name}")
         if name not in self.types:
-            raise DefinitionError(f"the definition of message type {name} is missing")
+            raise DefinitionError(f"message type {name} is used but not defined")
         self._open.add(name)
-        seen: set[str] = set()
-        size = 0
+        # A message without fields is padded with one byte by ROS 2, and rosbags says so in its own definitions.
         fields = [field for field in self.types[name] if field[0] != EMPTY_MESSAGE_FIELD]
+        seen: set[str] = set()
+        size = leaves = 0
         for field, description in fields:
-            if len(field) > MAX_NAME or not _FIELD_NAME.fullmatch(field):
-                raise DefinitionError(f"{_shown(field)} in {name} is not a field's name")
+            if not _FIELD_NAME.fullmatch(field) or len(field) > MAX_NAME:
+                raise DefinitionError(f"message type {name} has a field {_shown(field)}, which is not a name")
             attribute = attribute_name(field)
             if attribute in seen:
                 raise DefinitionError(f"message type {name} has field {field} twice")
             seen.add(attribute)
             size += self._field(f"{name}.{field}", description, depth)
+            leaves += self._leaves.get(referred(description) or "", 0) + 1
+        if leaves > MAX_LEAVES:
+            raise DefinitionError(f"message type {name} comes to more than {MAX_LEAVES} fields, all within it counted")
         self._open.discard(name)
-        self.done[name] = fields
-        self.smallest[name] = size
+        self.done[name], self.smallest[name], self._leaves[name] = fields, size, leaves
         return size
 
     def _field(self, where: str, description: FieldDesc, depth: int) -> int:
@@ -227,28 +265,71 @@ def attribute_name(field: str) -> str:
     return f"{field}_" if keyword.iskeyword(field) else field
 
 
-def _parse_msg(type_name: str, text: str) -> dict[str, Fielddefs]:
-    types: dict[str, Fielddefs] = {}
+def referred(description: FieldDesc) -> str | None:
+    """The message type that a field has, or has an array of."""
+    element = description[1][0] if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else description
+    return element[1] if element[0] == Nodetype.NAME else None
+
+
+def write_text(type_name: str, fields: Mapping[str, Fielddefs], *, ros1: bool = False) -> str:
+    """A tree in the MSG format with sections; the root's comes first. ros1: in the spelling and without bounds."""
+    sections = []
+    for name in [type_name, *(name for name in fields if name != type_name)]:
+        if ros1 and name in _ROS1_NAMES:
+            continue
+        lines = [] if name == type_name else [_SEPARATOR, f"MSG: {_spelled(name, ros1)}"]
+        sections += [*lines, *(f"{_spelled_type(description, ros1)} {field}" for field, description in fields[name])]
+    return "\n".join(sections) + "\n"
+
+
+def _spelled(name: str, ros1: bool) -> str:
+    """As definitions write it; `/srv/` and `/action/` stay."""
+    return _ROS1_NAMES[name] if ros1 and name in _ROS1_NAMES else name.replace("/msg/", "/")
+
+
+def _spelled_type(description: FieldDesc, ros1: bool) -> str:
+    if description[0] == Nodetype.BASE:
+        name, bound = description[1]
+        return f"{name}<={bound}" if bound and not ros1 else name
+    if description[0] == Nodetype.NAME:
+        return _spelled(description[1], ros1)
+    element, count = description[1]
+    size = str(count) if description[0] == Nodetype.ARRAY else f"<={count}" if count and not ros1 else ""
+    return f"{_spelled_type(element, ros1)}[{size}]"
+
+
+def _without_comment(line: str) -> str:
+    """The line as it counts. In the value of a string's constant or default, "#" is part of it."""
+    line = line.strip(" \t\r\n\ufeff")
+    if line.startswith("#"):
+        return ""
+    return line if line.startswith(("string", "wstring")) else line.partition("#")[0].rstrip()
+
+
+def _sections(type_name: str, lines: list[str]) -> Iterator[tuple[str, list[str]]]:
+    """The type names and lines of a definition in the MSG format. Raises DefinitionError."""
     section: str | None = type_name
-    fields: Fielddefs = []
-    for number, raw_line in enumerate(text.splitlines(), 1):
-        line = raw_line.strip(" \t\r\n\ufeff")
+    kept: list[str] = []
+    for line in lines:
         if line == _SEPARATOR and section is not None:
-            _add(types, section, fields)
-            section, fields = None, []
-        elif section is None:
-            if line.startswith("IDL:"):
-                raise DefinitionError(f"the definition of {type_name} mixes MSG and IDL")
-            if not line.startswith("MSG:"):
-                raise DefinitionError(f"line {number} of the definition of {type_name} should be MSG: pkg/Name")
+            yield section, kept
+            section, kept = None, []
+        elif section is not None:
+            kept.append(line)
+        elif line.startswith("MSG:"):
             section = normalised_type_name(line[4:].strip())
-        elif line and not line.startswith("#") and line != "@key":
-            field = _parse_line(section, line, number)
-            if field is not None:
-                fields.append(field)
+        else:
+            raise DefinitionError(f"after a separator, the definition of {type_name} should have MSG: pkg/Name")
     if section is None:
         raise DefinitionError(f"the definition of {type_name} ends after a separator")
-    _add(types, section, fields)
+    yield section, kept
+
+
+def _parse_msg(type_name: str, lines: list[str]) -> dict[str, Fielddefs]:
+    types: dict[str, Fielddefs] = {}
+    for section, kept in _sections(type_name, lines):
+        found = (_parse_line(section, line) for line in kept if line != "@key")
+        _add(types, section, [field for field in found if field is not None])
     return types
 
 
@@ -257,16 +338,16 @@ def _add(types: dict[str, Fielddefs], name: str, fields: Fielddefs) -> None:
         raise DefinitionError(f"message type {name} is defined twice, differently")
 
 
-def _parse_line(owner: str, line: str, number: int) -> tuple[str, FieldDesc] | None:
+def _parse_line(owner: str, line: str) -> tuple[str, FieldDesc] | None:
     """One field, or None for a constant."""
     match = _LINE.fullmatch(line)
     if match is None:
-        raise DefinitionError(f"line {number} in the definition of {owner} is not a field: {_shown(line)}")
+        raise DefinitionError(f"a line in the definition of {owner} is not a field: {_shown(line)}")
     if match["constant"]:
         return None
     element = _element(owner, match["type"], int(match["string_bound"] or 0))
     if match["string_bound"] and match["type"] not in ("string", "wstring"):
-        raise DefinitionError(f"line {number} in the definition of {owner}: only a string has a bound")
+        raise DefinitionError(f"in the definition of {owner}, only a string has a bound: {_shown(line)}")
     description: FieldDesc = element
     if match["array"]:
         if match["count"] and not match["bounded"]:
@@ -274,18 +355,20 @@ def _parse_line(owner: str, line: str, number: int) -> tuple[str, FieldDesc] | N
         elif bool(match["count"]) == bool(match["bounded"]):
             description = (Nodetype.SEQUENCE, (element, int(match["count"] or 0)))
         else:
-            raise DefinitionError(f"line {number} in the definition of {owner}: an array bound without a number")
+            raise DefinitionError(f"in the definition of {owner}, an array bound has no number: {_shown(line)}")
     return match["name"], description
 
 
 def _element(owner: str, name: str, bound: int) -> BaseDesc | NameDesc:
     if name in _BASES or name in _UNSUPPORTED:
         return cast(BaseDesc, (Nodetype.BASE, (name, bound)))
+    return (Nodetype.NAME, _full_name(owner, name))
+
+
+def _full_name(owner: str, name: str) -> str:
     if name in _SHORT_NAMES:
-        return (Nodetype.NAME, _SHORT_NAMES[name])
-    if "/" not in name:
-        name = f"{owner.rpartition('/')[0]}/{name}"
-    return (Nodetype.NAME, normalised_type_name(name))
+        return _SHORT_NAMES[name]
+    return normalised_type_name(name if "/" in name else f"{owner.rpartition('/')[0]}/{name}")
 
 
 def _parse_idl(type_name: str, text: str) -> dict[str, Fielddefs]:
@@ -299,6 +382,26 @@ def _parse_idl(type_name: str, text: str) -> dict[str, Fielddefs]:
         for name, fields in parse_idl(section, error).items():
             _add(types, normalised_type_name(name), fields)
     return types
+
+
+def _md5_of_one(owner: str, lines: list[str], sums: Mapping[str, str]) -> str:
+    constants, fields = [], []
+    for line in lines:
+        kind, *rest = line.partition("#")[0].split()
+        if any("=" in part for part in rest):
+            # In a string's value, "#" and spaces are part of the value.
+            declaration = line if kind == "string" else line.partition("#")[0]
+            name, _, value = declaration.partition(kind)[2].partition("=")
+            constants.append(f"{kind} {name.strip()}={value.strip()}")
+        elif not rest:
+            raise DefinitionError(f"a line in the definition of {owner} is not a field: {_shown(line)}")
+        else:
+            bare = kind.partition("[")[0]
+            shown = kind if bare in _BASES or bare in ("time", "duration") else sums.get(_full_name(owner, bare))
+            if shown is None:
+                raise DefinitionError(f"the definition of {owner} refers to {_shown(bare)}, which is not ROS 1's")
+            fields.append(f"{shown} {rest[0]}")
+    return hashlib.md5("\n".join([*constants, *fields]).encode(), usedforsecurity=False).hexdigest()
 
 
 def _shown(text: str) -> str:

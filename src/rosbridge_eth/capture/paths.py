@@ -20,20 +20,6 @@ from typing import Any
 
 _SEGMENT = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:\[(\*|[0-9]{1,9})\])?", re.ASCII)
 
-DEFAULT_FIELDS: Mapping[str, tuple[str, ...]] = {
-    # The covariances, 576 bytes of a message's 700, are left out.
-    "nav_msgs/msg/Odometry": (
-        "header.stamp",
-        "header.frame_id",
-        "child_frame_id",
-        "pose.pose.position",
-        "pose.pose.orientation",
-        "twist.twist.linear",
-        "twist.twist.angular",
-    ),
-}
-"""What is captured of a type when the configuration names no fields; of any other type, everything."""
-
 
 @dataclass
 class Selection:

@@ -1,8 +1,7 @@
-"""From a raw message to a record: is it due, decode it, choose its fields, keep it within bounds.
+"""From a raw message to a line: is it due, decode it, choose its fields, write it, keep it within bounds.
 
-No clock and no I/O: times come in as arguments, and what a person should hear
-goes out through a callback, once per topic and cause. Not thread-safe: one
-thread feeds one Capture.
+No clock and no I/O: times come in as arguments, and what a person should hear goes out through a callback, once per
+topic and cause. Not thread-safe: one thread feeds one Capture.
 """
 
 from __future__ import annotations
@@ -11,19 +10,20 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any, Final, NamedTuple
 
-from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge, to_json
+import orjson
+
+from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
+from rosbridge_eth.capture.lines import MAX_LINE, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
-from rosbridge_eth.capture.paths import DEFAULT_FIELDS, EVERYTHING, Selection, parse_paths
-from rosbridge_eth.capture.record import CapturedRecord
+from rosbridge_eth.capture.paths import EVERYTHING, Selection, parse_paths
 from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, rule_for
 from rosbridge_eth.errors import ConfigError
 
-MAX_DATA = 30 * 1024
-"""Bytes of one record's data as JSON, so that what is sealed never exceeds 32 KiB even if it does not compress."""
-
-MAX_CONVERSIONS = 8
+MAX_CONVERSIONS: Final = 8
 """Of one topic, for as many types or definitions; a publisher may bring another one with each of its connections."""
+_LAST_TIME: Final = 2**63 - 1
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +38,10 @@ class Cause(StrEnum):
     UNDECODABLE = "undecodable"
 
 
+DROPPED: Final = "dropped"
+"""Why a message is missing that a live source could not hand over in time."""
+
+
 @dataclass(frozen=True, slots=True)
 class Notice:
     """Said once per topic and cause; the counters say how often it happened."""
@@ -45,6 +49,17 @@ class Notice:
     topic: str
     cause: Cause
     text: str
+
+
+class Captured(NamedTuple):
+    """What became of a message: `line` is the record; data is JSON-ready, see conversion."""
+
+    topic: str
+    type_name: str
+    received_ns: int
+    line: bytes
+    decoder: Decoder
+    data: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +77,18 @@ class TopicStatistics:
 @dataclass
 class _Topic:
     rule: TopicRule
-    selection: Selection | None  # None: the default of each type
+    selection: Selection
     schedule: Schedule
     conversions: dict[Decoder, Conversion] = field(default_factory=dict)
-    said: set[Cause] = field(default_factory=set)
     captured: int = 0
     not_due: int = 0
-    refused: int = 0
-    undecodable: int = 0
-    fields_digested: int = 0
+    counts: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(Cause, 0))
 
     def statistics(self) -> TopicStatistics:
-        seen = self.captured + self.not_due + self.refused + self.undecodable
-        return TopicStatistics(seen, self.captured, self.not_due, self.refused, self.undecodable, self.fields_digested)
+        digested, undecodable = self.counts[Cause.FIELD_DIGESTED], self.counts[Cause.UNDECODABLE]
+        left_out = sum(self.counts.values()) - digested
+        seen = self.captured + self.not_due + left_out
+        return TopicStatistics(seen, self.captured, self.not_due, left_out - undecodable, undecodable, digested)
 
 
 def _log(notice: Notice) -> None:
@@ -84,24 +98,29 @@ def _log(notice: Notice) -> None:
 class Capture:
     """Captures by rules; a topic that none of them names or matches is not captured.
 
-    notify: is given each Notice; by default it is logged as a warning.
+    source_kind: stands in every line. notify: is given each Notice; by default it is logged as a warning.
     live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
     that is an error of the configuration.
     """
 
     def __init__(
-        self, rules: Sequence[TopicRule], notify: Callable[[Notice], None] = _log, *, live: bool = False
+        self,
+        rules: Sequence[TopicRule],
+        *,
+        source_kind: str,
+        notify: Callable[[Notice], None] = _log,
+        live: bool = False,
     ) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
         self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
-        self._selections = {id(rule): parse_paths(rule.fields) for rule in rules if rule.fields}
+        self._selections = {id(rule): parse_paths(rule.fields) if rule.fields else EVERYTHING for rule in rules}
         self._topics: dict[str, _Topic | None] = {}
+        self._source_kind = source_kind
         self._notify = notify
         self._live = live
+        self._declared: dict[tuple[str, str], int] = {}  # losses that are in a line already, by topic and why
 
-    def process(
-        self, raw: RawMessage, wall_ns: int, mono_ns: int, clock_synchronised: bool = False
-    ) -> CapturedRecord | None:
+    def process(self, raw: RawMessage, wall_ns: int, clock_synchronised: bool = False) -> Captured | None:
         """The record of a message, or None if it is not due, refused or cannot be decoded.
 
         Raises ConfigError if the rule names a field that the message's type does not have, unless `live`.
@@ -117,64 +136,60 @@ class Capture:
         except ConfigError as error:
             if not self._live:
                 raise
-            topic.refused += 1
-            self._say(raw.topic, topic, Cause.FIELD_MISSING, f"a message is left out: {error}")
+            self._left_out(raw, topic, Cause.FIELD_MISSING, str(error))
             return None
         digested_before = conversion.digested
         try:
+            if not 0 <= raw.received_ns <= _LAST_TIME:
+                raise DecodeError(f"its receive time is {raw.received_ns}")
             data = conversion.convert(raw.decoder.decode(raw.raw))
         except DecodeError as error:
-            topic.undecodable += 1
-            self._say(raw.topic, topic, Cause.UNDECODABLE, f"a message cannot be decoded and is left out: {error}")
+            self._left_out(raw, topic, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
             return None
         except FieldTooLarge as error:
-            topic.refused += 1
-            self._say(
-                raw.topic,
-                topic,
-                Cause.FIELD_TOO_LARGE,
-                f"a message is left out: {error}, more than {topic.rule.limit}; "
-                'choose other fields, or oversize = "digest"',
-            )
+            why = f'{error}, more than {topic.rule.limit}; choose other fields, or oversize = "digest"'
+            self._left_out(raw, topic, Cause.FIELD_TOO_LARGE, why)
             return None
-        data_json = to_json(data)
-        if len(data_json) > MAX_DATA or (not data_json.isascii() and len(data_json.encode()) > MAX_DATA):
-            topic.refused += 1
-            self._say(
-                raw.topic,
-                topic,
-                Cause.RECORD_TOO_LARGE,
-                f"a message is left out: its fields come to more than {MAX_DATA} bytes of JSON; choose fewer fields",
-            )
+        line = orjson.dumps(
+            {
+                "topic": raw.topic,
+                "type": raw.type_name,
+                "source": self._source_kind,
+                "received_ns": raw.received_ns,
+                "captured_ns": wall_ns,
+                "clock": clock_synchronised,
+                "data": data,
+            }
+        )
+        if len(line) > MAX_LINE:
+            why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
+            self._left_out(raw, topic, Cause.RECORD_TOO_LARGE, why)
             return None
-        digested = conversion.digested - digested_before
-        if digested:
-            self._say(
-                raw.topic,
-                topic,
-                Cause.FIELD_DIGESTED,
-                f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead",
-            )
+        if conversion.digested > digested_before:
+            text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
+            self._count(raw.topic, topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
         topic.schedule.captured(raw.received_ns)
         topic.captured += 1
-        topic.fields_digested += digested
-        return CapturedRecord(
-            raw.topic,
-            raw.type_name,
-            raw.received_ns,
-            wall_ns,
-            mono_ns,
-            clock_synchronised,
-            data,
-            topic.rule.delivery,
-            data_json,
-        )
+        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data)
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if the topic's rule does not fit the type."""
         state = self._topic(topic)
         if state is not None:
             self._compile(state, decoder)
+
+    def lost(self, source_dropped: Mapping[str, int]) -> list[bytes]:
+        """The lines for what was refused here, and dropped by the source, since the last call.
+
+        source_dropped: messages by topic since the source was opened, as `Source.dropped` has them.
+        """
+        so_far = {(topic, DROPPED): count for topic, count in source_dropped.items()}
+        for name, topic in self._topics.items():
+            if topic is not None:
+                so_far |= {(name, str(cause)): topic.counts[cause] for cause in Cause if cause != Cause.FIELD_DIGESTED}
+        new = {key: count - self._declared.get(key, 0) for key, count in so_far.items()}
+        self._declared |= so_far
+        return [lost_line(count, *key) for key, count in new.items() if count > 0]
 
     def statistics(self) -> Mapping[str, TopicStatistics]:
         """By topic, in the order in which they were first seen."""
@@ -191,21 +206,20 @@ class Capture:
     def _topic(self, name: str) -> _Topic | None:
         if name not in self._topics:
             rule = rule_for(name, self._rules)
-            self._topics[name] = None if rule is None else _Topic(rule, self._selections.get(id(rule)), Schedule(rule))
+            self._topics[name] = None if rule is None else _Topic(rule, self._selections[id(rule)], Schedule(rule))
         return self._topics[name]
 
     def _compile(self, topic: _Topic, decoder: Decoder) -> Conversion:
-        selection = topic.selection
-        if selection is None:
-            defaults = DEFAULT_FIELDS.get(decoder.type_name)
-            selection = parse_paths(defaults) if defaults else EVERYTHING
-        conversion = Conversion(decoder, selection, limit=topic.rule.limit, oversize=topic.rule.oversize)
+        conversion = Conversion(decoder, topic.selection, limit=topic.rule.limit, oversize=topic.rule.oversize)
         while len(topic.conversions) >= MAX_CONVERSIONS:
             del topic.conversions[next(iter(topic.conversions))]
         topic.conversions[decoder] = conversion
         return conversion
 
-    def _say(self, name: str, topic: _Topic, cause: Cause, text: str) -> None:
-        if cause not in topic.said:
-            topic.said.add(cause)
+    def _left_out(self, raw: RawMessage, topic: _Topic, cause: Cause, why: str) -> None:
+        self._count(raw.topic, topic, cause, f"a message is left out: {why}")
+
+    def _count(self, name: str, topic: _Topic, cause: Cause, text: str, count: int = 1) -> None:
+        topic.counts[cause] += count
+        if topic.counts[cause] == count:
             self._notify(Notice(name, cause, text))

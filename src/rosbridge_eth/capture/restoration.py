@@ -1,7 +1,8 @@
 """A record's data back to a message, for those who write what they read from the chain into a bag.
 
-The inverse of conversion. What was not captured (fields not selected, fields
-whose digest stands for them) is left zero, and named.
+The inverse of conversion. What was not captured (fields not selected, fields whose digest stands for them) is left
+zero, and named. A message of ROS 1 can be written as one of ROS 2 and the other way round: the fields are those of
+its definition, but for the `seq` of a header, which only ROS 1 has.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
 from rosbridge_eth.capture.conversion import NUMPY
-from rosbridge_eth.capture.definitions import DURATION, TIME
+from rosbridge_eth.capture.definitions import DURATION, HEADER, TIME, check_types, write_text
 from rosbridge_eth.capture.messages import Decoder, Wire
-from rosbridge_eth.errors import VerificationError
+from rosbridge_eth.errors import SourceError, VerificationError
 
 _SECOND: Final = 10**9
 _UINT32: Final = 2**32
@@ -46,11 +47,20 @@ class Restored:
 
 
 class Restoration:
-    """Builds messages of one type. `decoder.encode(restored.message)` gives their bytes."""
+    """Builds messages of one type, to be written with `decoder`: `decoder.encode(restored.message)`.
 
-    def __init__(self, decoder: Decoder) -> None:
-        self._decoder = decoder
-        self._build = self._message(decoder.type_name, "")
+    captured: the decoder by the definition that the log has (TypeLine.decoder); wire: how the messages are to be
+    written, by default as they were.
+    """
+
+    def __init__(self, captured: Decoder, wire: Wire | None = None) -> None:
+        """VerificationError for a type that this wire cannot have."""
+        self.decoder = captured if wire in (None, captured.wire) else _rewired(captured, wire)
+        # Of a header, what may stand in the data beside its fields, and what need not.
+        rewired = self.decoder is not captured
+        self._foreign = {"seq"} if rewired and self.decoder.wire is Wire.CDR else set()
+        self._new = {"seq"} if rewired and self.decoder.wire is Wire.ROS1 else set()
+        self._build = self._message(captured.type_name, "")
 
     def restore(self, data: Mapping[str, Any]) -> Restored:
         """The message of a record's data; VerificationError if the data does not fit the type."""
@@ -58,13 +68,21 @@ class Restoration:
         message = self._build(data, missing)
         return Restored(message, tuple(missing))
 
+    def connection(self) -> dict[str, Any]:
+        """What `add_connection` of rosbags' writers is to know of the type, besides topic and name."""
+        definition = self.decoder.definition
+        if self.decoder.wire is Wire.ROS1:
+            return {"msgdef": definition.text, "md5sum": definition.md5}
+        return {"msgdef": definition.text, "rihs01": self.decoder.typestore.hash_rihs01(definition.type_name)}
+
     def _message(self, type_name: str, path: str) -> Builder:
-        make = self._decoder.typestore.types[type_name]
+        make = self.decoder.typestore.types[type_name]
         members = [
             (name, self._value(description, f"{path}.{name}" if path else name))
-            for name, description in self._decoder.fields[type_name]
+            for name, description in self.decoder.fields[type_name]
         ]
-        names = {name for name, _ in members}
+        foreign, new = (self._foreign, self._new) if type_name == HEADER else (set(), set())
+        names = {name for name, _ in members} | foreign
 
         def build(data: Any, missing: list[str]) -> Any:
             if data is _ABSENT:
@@ -72,7 +90,9 @@ class Restoration:
                 return make(*[builder(_ABSENT, []) for _, builder in members])
             if not isinstance(data, dict) or not data.keys() <= names:
                 raise _unfit(path or type_name, data)
-            return make(*[builder(data.get(name, _ABSENT), missing) for name, builder in members])
+            return make(
+                *[builder(data.get(name, _ABSENT), [] if name in new else missing) for name, builder in members]
+            )
 
         return build
 
@@ -91,14 +111,13 @@ class Restoration:
 
     def _number(self, base: str, path: str) -> Builder:
         kind = numpy.dtype(NUMPY[base])
-        # rosbags packs a byte as signed, whatever it is in ROS 2.
-        unsigned_byte = base == "byte" and self._decoder.wire is Wire.CDR
+        is_byte = base == "byte"  # signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed
 
         def build(data: Any, missing: list[str]) -> Any:
             if data is _ABSENT:
                 missing.append(path)
                 return kind.type(0).item()
-            if unsigned_byte and type(data) is int and 0 <= data < 256:
+            if is_byte and type(data) is int and 0 <= data < 256:
                 return data - 256 if data > 127 else data
             return _checked(data, kind, path)
 
@@ -138,8 +157,8 @@ class Restoration:
         return build
 
     def _instant(self, type_name: str, path: str) -> Builder:
-        make = self._decoder.typestore.types[type_name]
-        ros1 = self._decoder.wire is Wire.ROS1
+        make = self.decoder.typestore.types[type_name]
+        ros1 = self.decoder.wire is Wire.ROS1
         unsigned = ros1 and type_name == TIME
 
         def build(data: Any, missing: list[str]) -> Any:
@@ -155,6 +174,22 @@ class Restoration:
             return make((seconds + _UINT32 // 2) % _UINT32 - _UINT32 // 2, nanoseconds)
 
         return build
+
+
+def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
+    """The decoder of the same type in the other wire form."""
+    ros1 = wire is Wire.ROS1
+    types = dict(captured.fields)
+    if HEADER in types:
+        header = [field for field in types[HEADER] if field[0] != "seq"]
+        types[HEADER] = [("seq", (Nodetype.BASE, ("uint32", 0))), *header] if ros1 else header
+    try:
+        if ros1 and any("/msg/" not in name for name in types):
+            raise SourceError("ROS 1 has no messages of actions and services")
+        text = write_text(captured.type_name, types, ros1=ros1)
+        return Decoder(wire or captured.wire, check_types(captured.type_name, types, text))
+    except SourceError as error:
+        raise VerificationError(f"{captured.type_name} cannot be written as {wire}: {error}") from None
 
 
 def _string(path: str) -> Builder:

@@ -1,4 +1,4 @@
-"""What is captured of which topic: fields, rate, moment or period, delivery class, oversize.
+"""What is captured of which topic: fields, rate, moment or period, oversize.
 
 All times are compared with a message's receive time, so a bag gives the same
 records at any replay speed.
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rosbridge_eth.capture.conversion import DEFAULT_LIMIT, OversizePolicy
-from rosbridge_eth.capture.record import Delivery
 
 
 @dataclass(frozen=True)
@@ -19,13 +18,12 @@ class TopicRule:
     """How the topics that match `topic` are captured.
 
     topic: a name, or a pattern: `*` and `?` within one part of a name, `**` across parts, `[ab]`.
-    fields: paths; empty means the type's default fields.
+    fields: paths; empty means every field.
     rate: records a second at most; None for every message.
     at_ns: only the first message received at this moment or after it.
     once: only the first message (of the period).
     from_ns, until_ns: only messages received in [from, until).
     for_ns: length of the period: from `from_ns`, or from the first message if that is None.
-    delivery: "reliable", or "latest": a newer record may supersede it while it waits.
     oversize, limit: what becomes of a field above `limit` bytes.
     """
 
@@ -37,7 +35,6 @@ class TopicRule:
     from_ns: int | None = None
     until_ns: int | None = None
     for_ns: int | None = None
-    delivery: Delivery = "reliable"
     oversize: OversizePolicy = "digest"
     limit: int = DEFAULT_LIMIT
 
