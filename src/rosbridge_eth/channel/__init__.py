@@ -1,8 +1,7 @@
 """The secure channel between robot and server, over UDP, without a socket in it: docs/channel.md.
 
-`Client` and `Server` take datagrams and the time, and give datagrams, events
-and the next time. `channel.udp` puts sockets under them, `channel.simulation`
-a network that loses, doubles, delays, reorders, corrupts and rebinds by seed.
+`Client` and `Server` take datagrams and the time, and give datagrams, events and the next time. `channel.udp` puts
+sockets under them.
 """
 
 from rosbridge_eth.channel.admission import Address
@@ -19,8 +18,7 @@ from rosbridge_eth.channel.events import (
     Event,
     Full,
     HandshakeFailed,
-    MessageAnswered,
-    MessageReceived,
+    Message,
     NotConnected,
     ServerConfig,
     Statistics,
@@ -30,27 +28,7 @@ from rosbridge_eth.channel.server import Server, cookie_key
 from rosbridge_eth.channel.wire import Mode, Reason
 
 __all__ = [
-    "Address",
-    "AddressChanged",
-    "ChannelConfig",
-    "Client",
-    "ClientConfig",
-    "Connected",
-    "Disconnected",
-    "Drop",
-    "End",
-    "Endpoint",
-    "Event",
-    "Full",
-    "HandshakeFailed",
-    "MessageAnswered",
-    "MessageReceived",
-    "Mode",
-    "NotConnected",
-    "Randomness",
-    "Reason",
-    "Server",
-    "ServerConfig",
-    "Statistics",
-    "cookie_key",
-]
+    "Address", "AddressChanged", "ChannelConfig", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End",
+    "Endpoint", "Event", "Full", "HandshakeFailed", "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server",
+    "ServerConfig", "Statistics", "cookie_key",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a server does before it trusts a datagram: cookies, reset tokens, and limits on what strangers cost it.
+"""What a server does before it trusts a datagram: cookies, and limits on what strangers cost it.
 
 A hostile HELLO costs one keyed hash and leaves no trace. A PROOF costs
 signatures, so it is admitted by its source (an address that proved, with a
@@ -12,51 +12,41 @@ from collections import OrderedDict
 from hashlib import blake2s
 from ipaddress import IPv4Address, ip_address
 
-from rosbridge_eth.channel.wire import COOKIE_SIZE, RESET_TOKEN_SIZE, Mode
-
-__all__ = ["Address", "Cookies", "Sources", "TokenBucket"]
+from rosbridge_eth.channel.wire import COOKIE_SIZE, Hello
 
 Address = tuple[str, int]
 """Host and port. More that a socket may add (flow label, scope) is kept out of it by the shell."""
 
 
 class Cookies:
-    """Cookies and reset tokens under one 32-byte key, shared by the processes of a server.
+    """Cookies under one 32-byte key, shared by the processes of a server.
 
-    A cookie is the time (8 bytes, ms) and a keyed hash of it, the address, and
-    the HELLO's fields. A reset token is a keyed hash of a connection id.
+    A cookie is the time (8 bytes, ms) and a keyed hash of it, the address, and the HELLO's fields.
     """
 
-    __slots__ = ("_cookie_key", "_reset_key", "lifetime")
+    __slots__ = ("_key", "lifetime")
 
     def __init__(self, key: bytes, lifetime: float) -> None:
         if len(key) != 32:
             raise ValueError(f"the cookie key must be 32 bytes, not {len(key)}")
-        self._cookie_key = blake2s(b"cookie", key=key).digest()
-        self._reset_key = blake2s(b"reset", key=key).digest()
+        self._key = blake2s(b"cookie", key=key).digest()
         self.lifetime = lifetime
 
-    def _hash(self, stamp: bytes, address: Address, mode: Mode, cid: bytes, nonce: bytes) -> bytes:
+    def _hash(self, stamp: bytes, address: Address, hello: Hello) -> bytes:
         place = f"{address[0]} {address[1]}".encode()
-        return blake2s(
-            stamp + bytes((mode,)) + cid + nonce + place, key=self._cookie_key, digest_size=COOKIE_SIZE - 8
-        ).digest()
+        bound = stamp + bytes((hello.mode,)) + hello.client_cid + hello.nonce + place
+        return blake2s(bound, key=self._key, digest_size=COOKIE_SIZE - 8).digest()
 
-    def make(self, address: Address, mode: Mode, cid: bytes, nonce: bytes, now: float) -> bytes:
+    def make(self, address: Address, hello: Hello, now: float) -> bytes:
         stamp = int(now * 1000).to_bytes(8, "big")
-        return stamp + self._hash(stamp, address, mode, cid, nonce)
+        return stamp + self._hash(stamp, address, hello)
 
-    def holds(
-        self, cookie: bytes, address: Address, mode: Mode, cid: bytes, nonce: bytes, now: float
-    ) -> bool:
+    def holds(self, cookie: bytes, address: Address, hello: Hello, now: float) -> bool:
         stamp = cookie[:8]
         age = now - int.from_bytes(stamp, "big") / 1000
         if not -0.001 <= age <= self.lifetime:
             return False
-        return hmac.compare_digest(cookie[8:], self._hash(stamp, address, mode, cid, nonce))
-
-    def reset_token(self, cid: bytes) -> bytes:
-        return blake2s(cid, key=self._reset_key, digest_size=RESET_TOKEN_SIZE).digest()
+        return hmac.compare_digest(cookie[8:], self._hash(stamp, address, hello))
 
 
 class TokenBucket:

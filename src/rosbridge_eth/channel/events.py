@@ -15,28 +15,9 @@ from rosbridge_eth.channel.wire import Mode, Reason
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.identity import PeerIdentity, Role
 
-__all__ = [
-    "AddressChanged",
-    "ChannelConfig",
-    "ClientConfig",
-    "Connected",
-    "Disconnected",
-    "Drop",
-    "End",
-    "Endpoint",
-    "Event",
-    "Full",
-    "HandshakeFailed",
-    "MessageAnswered",
-    "MessageReceived",
-    "NotConnected",
-    "ServerConfig",
-    "Statistics",
-]
-
 
 class Full(NetworkError):
-    """No more messages are taken until some are answered; ask `writable` first."""
+    """No more is taken until some of what was sent is acknowledged; ask `writable` first."""
 
 
 class NotConnected(NetworkError):
@@ -51,16 +32,15 @@ class End(StrEnum):
     REPLACED = "replaced by a newer session of the same identity"
     REVOKED = "identity revoked"
     SILENT = "the peer fell silent"
-    RESET = "the server does not know the session any more"
     PROTOCOL = "the peer broke the protocol"
-    EXHAUSTED = "the session's keys or numbers are used up"
+    EXPIRED = "the session's time or packet numbers are used up"
 
 
 class Drop(StrEnum):
     """Why a datagram was dropped without a word; the keys of Statistics.dropped."""
 
     MALFORMED = "malformed"
-    VERSION_OR_MODE = "other mode"
+    MODE = "other mode"
     UNEXPECTED = "unexpected in this state"
     ADDRESS = "from another address"
     COOKIE = "cookie wrong or too old"
@@ -72,12 +52,10 @@ class Drop(StrEnum):
     CERTIFICATE = "certificate refused"
     SIGNATURE = "handshake signature or confirmation wrong"
     UNKNOWN_CONNECTION = "unknown connection"
-    EPOCH = "unknown epoch"
     REPLAYED = "packet number seen before"
     TAG = "authentication failed"
     EARLY = "before the handshake was finished"
-    RESET = "reset that proves nothing"
-    FULL = "messages refused for lack of room"
+    FULL = "no room to keep it until what comes before it is there"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,35 +72,25 @@ class Connected:
 
 @dataclass(frozen=True, slots=True)
 class Disconnected:
-    """The session ended. unanswered: at a client, ids of messages without an answer, in order."""
+    """The session ended. What it did not deliver is the program's to send again in the next one."""
 
     reason: End
     connection: bytes
-    unanswered: tuple[int, ...] = ()
-    peer: PeerIdentity | None = None
+    peer: PeerIdentity
 
 
 @dataclass(frozen=True, slots=True)
-class MessageReceived:
-    """At a server: a message, once per connection. Answer it with `reply` after the commit."""
+class Message:
+    """A message of the peer's, in the order of its sending, once a session."""
 
     connection: bytes
-    message_id: int
     payload: bytes
     peer: PeerIdentity
 
 
 @dataclass(frozen=True, slots=True)
-class MessageAnswered:
-    """At a client: the server's answer to the message that `send` gave this id."""
-
-    message_id: int
-    payload: bytes
-
-
-@dataclass(frozen=True, slots=True)
 class AddressChanged:
-    """At a server: a client was proven to be at a new address, and is sent to there from now on."""
+    """At a server: a client was proven to be at a new address."""
 
     connection: bytes
     peer: PeerIdentity
@@ -140,7 +108,7 @@ class HandshakeFailed:
     hint: Reason | None = None
 
 
-Event = Connected | Disconnected | MessageReceived | MessageAnswered | AddressChanged | HandshakeFailed
+Event = Connected | Disconnected | Message | AddressChanged | HandshakeFailed
 
 
 class Endpoint(Protocol):
@@ -161,33 +129,22 @@ class Endpoint(Protocol):
 class ChannelConfig:
     """Settings of either end. Times in seconds, sizes in bytes."""
 
-    idle_timeout: float = 30.0
-    """A session without an authenticated packet for so long has ended."""
-    keep_alive: float = 10.0
-    """A client that sent nothing for so long sends a ping."""
-    silence_timeout: float = 10.0
-    """A client whose packets go unacknowledged for so long begins a new session."""
     max_ack_delay: float = 0.02
     ack_every: int = 8
     """Packets after which an acknowledgement is sent without waiting for max_ack_delay."""
-    max_message: int = 48 * 1024
-    max_unanswered: int = 256
-    """Messages of one session that wait for their answer. The smaller figure of both ends holds."""
-    max_unanswered_bytes: int = 1 << 20
-    max_window: int = 256 * 1024
+    max_message: int = 72 * 1024
+    max_buffered: int = 1 << 20
+    """Of one session: what was sent and is not acknowledged yet."""
+    max_window: int = 512 * 1024
     """Upper limit of the congestion window."""
-    rekey_packets: int = 1 << 20
-    rekey_seconds: float = 3600.0
-    rekey_interval: float = 1.0
-    """A peer's epochs may not follow each other faster."""
+    session_packets: int = 1 << 20
+    """A session ends when so many packets were sent in a direction."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.max_message <= 0xFFFF:
-            raise ValueError(f"max_message must be 1 to 65535 bytes, not {self.max_message}")
-        if self.max_unanswered < 1 or self.max_unanswered_bytes < self.max_message:
-            raise ValueError("max_unanswered and max_unanswered_bytes must hold at least one message")
-        if not 1 <= self.rekey_packets <= 1 << 22:
-            raise ValueError(f"rekey_packets must be 1 to 2**22, not {self.rekey_packets}")
+        if not 0 < self.max_message <= self.max_buffered - 4:
+            raise ValueError("max_buffered must hold at least one message of max_message bytes")
+        if not 1 <= self.session_packets <= 1 << 23:  # RFC 9001, 6.6: the limit of GCM with 128-bit keys
+            raise ValueError(f"session_packets must be 1 to 2**23, not {self.session_packets}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -196,6 +153,13 @@ class ClientConfig(ChannelConfig):
 
     mode: Mode = Mode.EXCHANGE
     """The one it uses; it never falls back to another."""
+    keep_alive: float = 10.0
+    """A client that sent nothing for so long sends a ping; three times as often while it waits for something."""
+    patience: float = 10.0
+    patience_max: float = 60.0
+    """A client that waits and gets no packet for so long makes a new session; doubled each time, up to the second."""
+    session_seconds: tuple[float, float] = (2700.0, 3600.0)
+    """The age at which a session is ended and another made, drawn between the two."""
     reconnect_min: float = 0.25
     reconnect_max: float = 10.0
     """A client's wait before another handshake grows from one to the other, less up to a half by chance."""
@@ -212,19 +176,23 @@ class ServerConfig(ChannelConfig):
     roles: tuple[Role, ...] = (Role.ROBOT,)
     worker: int = 0
     """This process's number among those that share the port (0 to 255): first byte of its connection ids."""
+    idle_timeout: float = 30.0
+    """A session without an authenticated packet for so long has ended."""
+    session_seconds: float = 3900.0
+    """A session that its client did not end by this age is ended."""
     cookie_lifetime: float = 20.0
     half_open_timeout: float = 10.0
     max_half_open: int = 1024
     max_connections: int = 4096
     max_total_bytes: int = 64 << 20
-    """Messages without an answer, parts of messages and answers without an acknowledgement, all connections."""
+    """Of all sessions: messages that were not taken, parts of messages, and segments that came too early. Above it,
+    only what comes in order is taken."""
     source_rate: float = 10.0
     source_burst: float = 400.0
     """Handshakes that one source may fail per second, and at once."""
     max_sources: int = 4096
     handshake_share: float = 0.5
     """Share of time that handshakes may take."""
-    reset_rate: float = 100.0
     max_certificates: int = 4096
     certificate_recheck: float = 600.0
     """A verified pair of certificates is believed for so long before its chain is verified again."""
@@ -237,22 +205,20 @@ class ServerConfig(ChannelConfig):
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Counters of an endpoint since it was made."""
+    """Counters of an endpoint since it was made, and after them what is there at this moment."""
 
     datagrams_sent: int = 0
     datagrams_received: int = 0
     bytes_sent: int = 0
     bytes_received: int = 0
     packets_lost: int = 0
-    frames_retransmitted: int = 0
-    messages: int = 0
-    answers: int = 0
+    retransmitted: int = 0
     duplicates: int = 0
+    messages_sent: int = 0
+    messages_received: int = 0
     handshakes: int = 0
     handshakes_begun: int = 0
     cookies: int = 0
-    resets: int = 0
-    rekeys: int = 0
     address_changes: int = 0
     connections: int = 0
     half_open: int = 0
@@ -262,8 +228,6 @@ class Statistics:
 
 class Counters:
     """The counters while they count; `Statistics` is what is shown of them."""
-
-    __slots__ = ("count", "dropped")
 
     def __init__(self) -> None:
         self.count: Counter[str] = Counter()

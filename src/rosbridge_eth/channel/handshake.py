@@ -7,10 +7,10 @@
              signature over H1                          ─────────▶  half open
              N_s, cid_s, certificates, R_B or C,
              signature over H2, S_B, finished over H3   ◀─────────  OFFER
-    FINISHED S_A, finished over H4 (first DATA frame)   ─────────▶  session
+    FINISHED S_A, finished over H4, sealed               ─────────▶  session
 
 Mode `exchange`: SM2 key exchange, GB/T 32918.3-2016, 6.1, client A, server B,
-ephemeral points R_A and R_B, confirmations S_B and S_A; ID = role ‖ SM3 of the
+ephemeral points R_A and R_B, confirmations S_B and S_A; ID = role | SM3 of the
 encryption certificate. K is 32 bytes. Forward secret.
 
 Mode `transport`: the server draws K (32 bytes) and sends C, K encrypted by SM2
@@ -32,33 +32,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 
+from rosbridge_eth import identity as ids
+from rosbridge_eth.channel import wire
 from rosbridge_eth.channel.events import Drop
 from rosbridge_eth.channel.protection import SessionSecrets, finished
-from rosbridge_eth.channel.wire import (
-    CID_SIZE,
-    NONCE_SIZE,
-    VERSION,
-    Hello,
-    Malformed,
-    Mode,
-    Reason,
-    fields,
-    parse_fields,
-)
-from rosbridge_eth.identity import (
-    ExpiredCertificate,
-    Identity,
-    NotAllowed,
-    PeerIdentity,
-    Role,
-    Trust,
-    UntrustedCertificate,
-    sign,
-    verify,
-)
+from rosbridge_eth.channel.wire import Hello, Malformed, Mode, Reason
+from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust
 from smcrypto import SMCryptoError, sm2, sm3
-
-__all__ = ["ClientHandshake", "HandshakeRefused", "Randomness", "ServerHandshake", "VerifiedCertificates"]
 
 SHARED_SIZE = 32
 POINT_SIZE = 65
@@ -103,15 +83,9 @@ class VerifiedCertificates:
         return len(self._known)
 
     def check(
-        self,
-        signing: bytes,
-        encryption: bytes,
-        *,
-        role: Role | Iterable[Role],
-        name: str | None,
-        at: datetime,
-        now: float,
-    ) -> PeerIdentity:
+        self, signing: bytes, encryption: bytes, *,
+        role: Role | Iterable[Role], name: str | None, at: datetime, now: float,
+    ) -> PeerIdentity:  # fmt: skip
         """As Trust.check; `now` is the monotonic clock."""
         pair = (signing, encryption)
         entry = self._known.get(pair)
@@ -126,18 +100,24 @@ class VerifiedCertificates:
 
 
 def exchange_id(role: Role, encryption_certificate: bytes) -> bytes:
-    """ID of GB/T 32918.3 for one end: its role's name ‖ SM3 of its encryption certificate (DER)."""
+    """ID of GB/T 32918.3 for one end: its role's name | SM3 of its encryption certificate (DER)."""
     return role.value.encode("ascii") + sm3.digest(encryption_certificate)
 
 
-def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
-    return sm3.SM3(
-        b"rosbridge-eth/1 handshake\0"
-        + bytes((VERSION, hello.mode))
-        + hello.client_cid
-        + hello.nonce
-        + cookie
+def _exchange(mine: Identity, peer: PeerIdentity, ephemeral: sm2.PrivateKey, *, initiator: bool) -> sm2.KeyExchange:
+    return sm2.KeyExchange(
+        mine.encryption_key,
+        exchange_id(mine.role, mine.encryption_certificate.to_der()),
+        peer.encryption_certificate.public_key,
+        exchange_id(peer.role, peer.encryption_certificate.to_der()),
+        initiator=initiator,
+        ephemeral_key=ephemeral,
     )
+
+
+def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
+    version_and_mode = bytes((wire.VERSION, hello.mode))
+    return sm3.SM3(b"rosbridge-eth/2 handshake\0" + version_and_mode + hello.client_cid + hello.nonce + cookie)
 
 
 def _digest(transcript: sm3.SM3) -> bytes:
@@ -160,7 +140,7 @@ class ClientHandshake:
     """One attempt of a client. `hello`, then `proof(cookie)`, then `accept(offer)` until one is good."""
 
     def __init__(self, mode: Mode, identity: Identity, cid: bytes, randomness: Randomness) -> None:
-        self.hello = Hello(mode, cid, randomness.bytes(NONCE_SIZE))
+        self.hello = Hello(mode, cid, randomness.bytes(wire.NONCE_SIZE))
         self._identity = identity
         self._ephemeral = randomness.private_key() if mode is Mode.EXCHANGE else None
         self._transcript: sm3.SM3 | None = None
@@ -168,66 +148,45 @@ class ClientHandshake:
     def proof(self, cookie: bytes) -> bytes:
         """The body of the PROOF."""
         identity = self._identity
-        parts = [
-            identity.signing_certificate.to_der(),
-            identity.encryption_certificate.to_der(),
-            self._ephemeral.public_key.to_bytes() if self._ephemeral else b"",
-        ]
+        point = self._ephemeral.public_key.to_bytes() if self._ephemeral else b""
         transcript = _transcript(self.hello, cookie)
-        unsigned = fields(parts)
+        unsigned = wire.fields([identity.signing_certificate.to_der(), identity.encryption_certificate.to_der(), point])
         transcript.update(unsigned)
-        signature = fields([sign(identity.signing_key, "handshake", b"client" + _digest(transcript))])
+        signature = wire.fields([ids.sign(identity.signing_key, "handshake", b"client" + _digest(transcript))])
         transcript.update(signature)
         self._transcript = transcript
         return unsigned + signature
 
     def accept(
-        self,
-        body: bytes,
-        certificates: VerifiedCertificates,
-        *,
-        server_name: str | None,
-        at: datetime,
-        now: float,
+        self, body: bytes, certificates: VerifiedCertificates, *, server_name: str | None, at: datetime, now: float
     ) -> Agreed:
         """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
         if self._transcript is None:
             raise HandshakeRefused(Drop.UNEXPECTED, "an offer before the proof")
         try:
-            parts, offsets = parse_fields(body, 8)
+            parts, offsets = wire.parse_fields(body, 8)
         except Malformed as error:
             raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
         nonce, server_cid, signing, encryption, material, signature, confirmation, mac = parts
         exchange = self._ephemeral is not None
         if (
-            len(nonce) != NONCE_SIZE
-            or len(server_cid) != CID_SIZE
+            len(nonce) != wire.NONCE_SIZE
+            or len(server_cid) != wire.CID_SIZE
             or len(confirmation) != (CONFIRMATION_SIZE if exchange else 0)
             or (exchange and len(material) != POINT_SIZE)
         ):
             raise HandshakeRefused(Drop.MALFORMED, "a field of the offer has another length")
         try:
-            peer = certificates.check(
-                signing, encryption, role=Role.SERVER, name=server_name, at=at, now=now
-            )
-        except UntrustedCertificate as error:
+            peer = certificates.check(signing, encryption, role=Role.SERVER, name=server_name, at=at, now=now)
+        except ids.UntrustedCertificate as error:
             raise HandshakeRefused(Drop.CERTIFICATE, str(error)) from error
         transcript = self._transcript.copy()
         transcript.update(body[: offsets[5]])
         try:
-            verify(
-                peer.signing_certificate.public_key, "handshake", b"server" + _digest(transcript), signature
-            )
+            ids.verify(peer.signing_certificate.public_key, "handshake", b"server" + _digest(transcript), signature)
             transcript.update(body[offsets[5] : offsets[7]])
             if self._ephemeral is not None:
-                exchange_a = sm2.KeyExchange(
-                    self._identity.encryption_key,
-                    exchange_id(self._identity.role, self._identity.encryption_certificate.to_der()),
-                    peer.encryption_certificate.public_key,
-                    exchange_id(peer.role, encryption),
-                    initiator=True,
-                    ephemeral_key=self._ephemeral,
-                )
+                exchange_a = _exchange(self._identity, peer, self._ephemeral, initiator=True)
                 shared, own = exchange_a.agree(material, SHARED_SIZE)
                 exchange_a.confirm(confirmation)
             else:
@@ -265,61 +224,41 @@ class ServerHandshake:
         """Raise HandshakeRefused unless certificates and signature hold. The cookie was checked before."""
         exchange = hello.mode is Mode.EXCHANGE
         try:
-            (signing, encryption, point, signature), offsets = parse_fields(body, 4)
+            (signing, encryption, point, signature), offsets = wire.parse_fields(body, 4)
         except Malformed as error:
             raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
         if len(point) != (POINT_SIZE if exchange else 0):
             raise HandshakeRefused(Drop.MALFORMED, "a field of the proof has another length")
         try:
             self.peer = certificates.check(signing, encryption, role=roles, name=None, at=at, now=now)
-        except UntrustedCertificate as error:
-            hint = {ExpiredCertificate: Reason.EXPIRED, NotAllowed: Reason.NOT_ALLOWED}.get(
-                type(error), Reason.CERTIFICATE
-            )
+        except ids.UntrustedCertificate as error:
+            hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
+            hint = hints.get(type(error), Reason.CERTIFICATE)
             raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
         transcript = _transcript(hello, cookie)
         transcript.update(body[: offsets[3]])
         self._exchange: sm2.KeyExchange | None = None
         try:
-            verify(
-                self.peer.signing_certificate.public_key,
-                "handshake",
-                b"client" + _digest(transcript),
-                signature,
-            )
+            signer = self.peer.signing_certificate.public_key
+            ids.verify(signer, "handshake", b"client" + _digest(transcript), signature)
             transcript.update(body[offsets[3] :])
-            public_key = self.peer.encryption_certificate.public_key
             if exchange:
-                self._exchange = sm2.KeyExchange(
-                    identity.encryption_key,
-                    exchange_id(identity.role, identity.encryption_certificate.to_der()),
-                    public_key,
-                    exchange_id(self.peer.role, encryption),
-                    initiator=False,
-                    ephemeral_key=randomness.private_key(),
-                )
+                self._exchange = _exchange(identity, self.peer, randomness.private_key(), initiator=False)
                 shared, confirmation = self._exchange.agree(point, SHARED_SIZE)
                 material = self._exchange.ephemeral
             else:
                 shared, confirmation = randomness.bytes(SHARED_SIZE), b""
-                material = public_key.encrypt(shared)
+                material = self.peer.encryption_certificate.public_key.encrypt(shared)
         except SMCryptoError as error:
             raise HandshakeRefused(Drop.SIGNATURE, "the proof does not hold") from error
-        unsigned = fields(
-            [
-                randomness.bytes(NONCE_SIZE),
-                server_cid,
-                identity.signing_certificate.to_der(),
-                identity.encryption_certificate.to_der(),
-                material,
-            ]
-        )
+        mine = (identity.signing_certificate.to_der(), identity.encryption_certificate.to_der())
+        unsigned = wire.fields([randomness.bytes(wire.NONCE_SIZE), server_cid, *mine, material])
         transcript.update(unsigned)
-        signature = sign(identity.signing_key, "handshake", b"server" + _digest(transcript))
-        signed = fields([signature, confirmation])
+        signature = ids.sign(identity.signing_key, "handshake", b"server" + _digest(transcript))
+        signed = wire.fields([signature, confirmation])
         transcript.update(signed)
         self.secrets = SessionSecrets(shared, _digest(transcript), hello.mode)
-        last = fields([finished(self.secrets.server_finished, _digest(transcript))])
+        last = wire.fields([finished(self.secrets.server_finished, _digest(transcript))])
         transcript.update(last)
         self._finished = finished(self.secrets.client_finished, _digest(transcript))
         self.offer = unsigned + signed + last

@@ -1,30 +1,22 @@
 """Keys of a session, sealed packets, and the replay window.
 
-Key schedule, HKDF with SM3 (RFC 5869). K is the handshake's shared secret, H
-the hash of its whole transcript, `mode` the mode's name:
+Key schedule, HKDF with SM3 (RFC 5869). K is the handshake's shared secret, H the hash of its whole transcript,
+`mode` the mode's name:
 
-    client ‖ server ‖ client-finished ‖ server-finished (32 each)
-        = HKDF(K, salt = H, info = "rosbridge-eth/1 session " ‖ mode)
-    key (16) ‖ IV (12) ‖ next secret (32) = HKDF(secret, info = "rosbridge-eth/1 packets")
+    client | server | client-finished | server-finished (32 each)
+        = HKDF(K, salt = H, info = "rosbridge-eth/2 session " | mode)
+    key (16) | IV (12) = HKDF(client or server, info = "rosbridge-eth/2 packets")
 
-Each direction has its own secret, and its epochs follow one another by the
-next secret: who learns the keys of an epoch learns nothing of the one before.
-
-Packets: SM4-GCM (RFC 8998), nonce = IV ⊕ packet number, the header as
-associated data. Packet numbers run through all epochs of a session and are
-never used twice.
+Packets: SM4-GCM (RFC 8998), nonce = IV xor packet number, the header as associated data. Numbers count from 0 in
+each direction and are never used twice; a session ends long before its keys are used up, so there is no key update.
 """
 
 from __future__ import annotations
 
 import hmac
 
-from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, Mode, data_header
+from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, Kind, Mode
 from smcrypto import kdf, sm3, sm4
-
-__all__ = ["Direction", "ReplayWindow", "SessionSecrets", "finished"]
-
-SECRET_SIZE = 32
 
 
 class SessionSecrets:
@@ -33,10 +25,10 @@ class SessionSecrets:
     __slots__ = ("client", "client_finished", "server", "server_finished")
 
     def __init__(self, shared: bytes, transcript: bytes, mode: Mode) -> None:
-        info = b"rosbridge-eth/1 session " + mode.name.lower().encode("ascii")
-        derived = kdf.hkdf(shared, 4 * SECRET_SIZE, salt=transcript, info=info)
+        info = b"rosbridge-eth/2 session " + mode.name.lower().encode("ascii")
+        derived = kdf.hkdf(shared, 128, salt=transcript, info=info)
         self.client, self.server, self.client_finished, self.server_finished = (
-            derived[i : i + SECRET_SIZE] for i in range(0, 4 * SECRET_SIZE, SECRET_SIZE)
+            derived[i : i + 32] for i in range(0, 128, 32)
         )
 
 
@@ -46,59 +38,51 @@ def finished(secret: bytes, transcript: bytes) -> bytes:
 
 
 class Direction:
-    """The keys of one direction of a session in one epoch; `next_epoch` gives the following one's."""
+    """The keys of one direction of a session."""
 
-    __slots__ = ("_aead", "_iv", "_next_secret", "epoch")
+    __slots__ = ("_aead", "_iv")
 
-    def __init__(self, secret: bytes, epoch: int = 0) -> None:
-        derived = kdf.hkdf(secret, 16 + 12 + SECRET_SIZE, info=b"rosbridge-eth/1 packets")
+    def __init__(self, secret: bytes) -> None:
+        derived = kdf.hkdf(secret, 28, info=b"rosbridge-eth/2 packets")
         self._aead = sm4.SM4GCM(derived[:16])
-        self._iv = int.from_bytes(derived[16:28], "big")
-        self._next_secret = derived[28:]
-        self.epoch = epoch
-
-    def next_epoch(self) -> Direction:
-        return Direction(self._next_secret, self.epoch + 1)
+        self._iv = int.from_bytes(derived[16:], "big")
 
     def seal(self, cid: bytes, number: int, frames: bytes) -> bytes:
         """The datagram that carries `frames`: header, ciphertext, tag."""
-        header = data_header(self.epoch, cid, number)
+        header = b"%c%b%b" % (Kind.DATA, cid, number.to_bytes(4, "big"))
         return header + self._aead.encrypt((self._iv ^ number).to_bytes(12, "big"), frames, header)
 
     def open(self, datagram: bytes, number: int) -> bytes:
         """The frames of a datagram whose packet number is `number`, or smcrypto.InvalidTag."""
-        return self._aead.decrypt(
-            (self._iv ^ number).to_bytes(12, "big"),
-            datagram[DATA_HEADER_SIZE:],
-            datagram[:DATA_HEADER_SIZE],
-        )
+        nonce = (self._iv ^ number).to_bytes(12, "big")
+        return self._aead.decrypt(nonce, datagram[DATA_HEADER_SIZE:], datagram[:DATA_HEADER_SIZE])
 
 
 class ReplayWindow:
     """Which of the last `size` packet numbers were received; older ones count as received.
 
-    `seen` changes nothing; `mark` is for numbers that were authenticated.
+    `seen` changes nothing; `mark` is for numbers that were authenticated. Bit i of `bits`: highest - i was received.
     """
 
-    __slots__ = ("_bits", "_mask", "highest", "size")
+    __slots__ = ("_mask", "bits", "highest", "size")
 
     def __init__(self, size: int = 2048) -> None:
         self.size = size
         self.highest = -1
-        self._bits = 0  # bit i: highest - i was received
+        self.bits = 0
         self._mask = (1 << size) - 1
 
     def seen(self, number: int) -> bool:
         behind = self.highest - number
         if behind < 0:
             return False
-        return behind >= self.size or bool(self._bits >> behind & 1)
+        return behind >= self.size or bool(self.bits >> behind & 1)
 
     def mark(self, number: int) -> None:
         ahead = number - self.highest
         if ahead > 0:
-            # Shifted no further than the window is wide: a jump of 2**40 must not make a number of 2**40 bits.
-            self._bits = (self._bits << min(ahead, self.size) | 1) & self._mask
+            # Shifted no further than the window is wide: a jump of 2**30 must not make a number of 2**30 bits.
+            self.bits = (self.bits << min(ahead, self.size) | 1) & self._mask
             self.highest = number
         else:
-            self._bits |= 1 << -ahead
+            self.bits |= 1 << -ahead

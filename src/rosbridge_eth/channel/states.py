@@ -1,10 +1,8 @@
-"""The states of a client's handshake and of a server's connection, as tables; an absent pair is an error.
+"""The states of a client and of a server's connection, as tables; an absent pair is an error.
 
-What comes from the network is looked up first: a datagram whose input is not
-in the table for the present state is dropped and counted. What this program
-itself does in the wrong state is a mistake of this program, and raises.
-docs/channel.md shows these tables; `python -m rosbridge_eth.channel.states`
-prints them.
+What comes from the network is looked up first: a datagram whose input is not in the table for the present state is
+dropped and counted. What this program itself does in the wrong state is a mistake of this program, and raises.
+docs/channel.md shows these tables; `python -m rosbridge_eth.channel.states` prints them.
 """
 
 from __future__ import annotations
@@ -12,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import TypeVar
-
-__all__ = ["CLIENT", "SERVER", "ClientInput", "ClientState", "ServerInput", "ServerState", "advance", "as_markdown"]
 
 
 class ClientState(StrEnum):
@@ -37,7 +33,7 @@ class ClientInput(StrEnum):
     ACCEPTED = "ACCEPTED"
     FAILED = "attempt failed"
     RETRY = "wait is over"
-    LOST = "session lost"
+    LOST = "session ended"
     CLOSE = "close()"
     CLOSED = "closed"
 
@@ -71,7 +67,6 @@ CLIENT: Mapping[tuple[ClientState, ClientInput], ClientState] = {
     (ClientState.PROVING, ClientInput.CLOSE): ClientState.IDLE,
     (ClientState.FINISHING, ClientInput.ACCEPTED): ClientState.CONNECTED,
     (ClientState.FINISHING, ClientInput.FAILED): ClientState.WAITING,
-    (ClientState.FINISHING, ClientInput.LOST): ClientState.WAITING,
     (ClientState.FINISHING, ClientInput.CLOSE): ClientState.CLOSING,
     (ClientState.CONNECTED, ClientInput.LOST): ClientState.WAITING,
     (ClientState.CONNECTED, ClientInput.CLOSE): ClientState.CLOSING,
@@ -110,7 +105,4 @@ def as_markdown(table: Mapping[tuple[State, Input], State]) -> str:
 
 
 if __name__ == "__main__":
-    print("Client\n")
-    print(as_markdown(CLIENT))
-    print("\nServer, one connection\n")
-    print(as_markdown(SERVER))
+    print(f"Client\n\n{as_markdown(CLIENT)}\n\nServer, one connection\n\n{as_markdown(SERVER)}")

@@ -4,7 +4,7 @@ Several processes of a server share one port by SO_REUSEPORT. Where the kernel
 takes a filter for it (Linux, SO_ATTACH_REUSEPORT_CBPF), a datagram goes to
 the process whose number stands in its connection id, so a robot whose address
 changes stays with its process; elsewhere the kernel chooses by address, and
-such a robot makes a new session after `silence_timeout`.
+such a robot makes a new session after `patience`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.events import Endpoint, Event
 from rosbridge_eth.errors import NetworkError
 
-__all__ = ["UdpLoop", "client_socket", "server_sockets"]
-
 RECEIVE_BUFFER = 4 << 20  # bytes: about 3,500 full datagrams while the process is busy elsewhere
 SEND_BUFFER = 1 << 20
 LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
@@ -35,23 +33,8 @@ LONGEST_WAIT = 1.0  # s
 _SO_REUSEPORT = getattr(socket, "SO_REUSEPORT", None)
 _SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
 
-_TRANSIENT = frozenset(
-    {
-        errno.EAGAIN,
-        errno.ENOBUFS,
-        errno.ENETDOWN,
-        errno.ENETUNREACH,
-        errno.EHOSTDOWN,
-        errno.EHOSTUNREACH,
-        errno.ECONNREFUSED,
-        errno.ECONNRESET,
-        errno.EADDRNOTAVAIL,
-        errno.EPERM,
-        errno.EACCES,
-        errno.EMSGSIZE,
-    }
-)
-"""What a network may do to a datagram: it is lost, and the channel sends it again."""
+_NOT_THE_NETWORK = frozenset({errno.EBADF, errno.ENOTSOCK, errno.EFAULT, errno.ENOMEM})
+"""Errors of recvfrom that say that this socket is of no use any more. Any other is news of a datagram sent before."""
 
 
 def _open(family: int) -> socket.socket:
@@ -246,8 +229,8 @@ class UdpLoop:
             except BlockingIOError:
                 return
             except OSError as error:
-                if error.errno in _TRANSIENT:
-                    continue  # news of a datagram sent before, such as ECONNREFUSED
+                if error.errno not in _NOT_THE_NETWORK:
+                    continue  # ECONNREFUSED and the like
                 raise NetworkError(f"the socket cannot be read: {error.strerror}") from error
             take(data, (place[0], place[1]), now)
 
@@ -264,7 +247,5 @@ class UdpLoop:
         for data, address in self.endpoint.datagrams_to_send(now):
             try:
                 send(data, address)
-            except OSError as error:
-                if error.errno not in _TRANSIENT:
-                    raise NetworkError(f"the socket cannot be written: {error.strerror}") from error
+            except (OSError, OverflowError):  # a full buffer, no route, port 0: the channel sends again what matters
                 self.lost_sends += 1

@@ -1,6 +1,6 @@
 """A network made of a seed: it loses, doubles, delays, reorders and corrupts datagrams, and moves hosts.
 
-For tests and for trying out settings: whole conversations in simulated time,
+Whole conversations in simulated time,
 no socket, no sleeping, the same every time for the same seed. Random numbers
 here decide the fate of datagrams and are not near any key.
 """
@@ -12,10 +12,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import Endpoint, Event
-
-__all__ = ["Faults", "Host", "Network"]
+from rosbridge_eth.channel import Address, Endpoint, Event
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +42,7 @@ class Network:
     def __init__(self, seed: int, faults: Faults, *, start: float = 1000.0) -> None:
         self.now = start
         self.faults = faults
-        self.random = random.Random(seed)  # noqa: S311 - fate, not secrets
+        self.random = random.Random(seed)
         self.hosts: list[Host] = []
         self.delivered = 0
         self.watch: Callable[[bytes, Address, Address], None] | None = None

@@ -1,0 +1,135 @@
+"""Which packets are lost, and how fast to send. Loss and round trip after RFC 9002; the window is this project's.
+
+Names are RFC 9002's: smoothed RTT, RTT variance, PTO (probe timeout). A packet is lost when one sent three after it
+is acknowledged, or one sent later and 9/8 of a round trip have passed (6.1).
+
+The window follows the queue that it makes, not loss, since radio loses without being full; see `Window`.
+Left out: ECN, state per path.
+"""
+
+from __future__ import annotations
+
+from rosbridge_eth.channel.wire import DATAGRAM_SIZE
+
+PACKET_THRESHOLD = 3
+TIME_THRESHOLD = 9 / 8
+GRANULARITY = 0.001  # s
+INITIAL_RTT = 0.2  # s; RFC 9002 has 0.333, a handshake has usually measured it before
+MAX_PTO = 4.0  # s: after an outage the path is tried at least this often
+
+
+class RoundTrip:
+    """RTT estimate (RFC 9002, 5.3), in seconds."""
+
+    __slots__ = ("latest", "minimum", "smoothed", "variance")
+
+    def __init__(self, sample: float | None = None) -> None:
+        self.latest = self.minimum = 0.0
+        self.smoothed, self.variance = INITIAL_RTT, INITIAL_RTT / 2
+        if sample is not None:
+            self.update(sample, 0.0)
+
+    def update(self, sample: float, ack_delay: float) -> None:
+        self.latest = sample = max(sample, 1e-6)
+        if not self.minimum:
+            self.minimum = self.smoothed = sample
+            self.variance = sample / 2
+            return
+        self.minimum = min(self.minimum, sample)
+        if sample - ack_delay >= self.minimum:
+            sample -= ack_delay
+        self.variance += (abs(self.smoothed - sample) - self.variance) / 4
+        self.smoothed += (sample - self.smoothed) / 8
+
+    def pto(self, max_ack_delay: float, count: int = 0) -> float:
+        """How long to wait for an acknowledgement after `count` probes went unanswered (6.2)."""
+        base = self.smoothed + max(4 * self.variance, GRANULARITY) + max_ack_delay
+        return float(min(base * 2 ** min(count, 16), max(MAX_PTO, base)))
+
+    def loss_delay(self) -> float:
+        return max(TIME_THRESHOLD * max(self.latest, self.smoothed), GRANULARITY)
+
+
+INITIAL_WINDOW = 16 * DATAGRAM_SIZE
+MINIMUM_WINDOW = 2 * DATAGRAM_SIZE
+QUEUE_SHARE = 8 * DATAGRAM_SIZE
+"""What a sender wants to have waiting in the path's queue."""
+NO_QUEUE = (1.25, 0.005)
+"""A round trip below 1.25 times the shortest one and 5 ms has met no queue."""
+GAIN = 1.7
+"""The window is at most so many times what one of the last round trips delivered: it holds up to 1 - 1/1.7 = 41 % of
+loss, and a link that drops instead of queueing is overdriven by no more than that."""
+BASE_PERIOD = 30.0  # s; the shortest round trip is that of the last one or two periods
+PACING_GAIN = 1.25
+PACING_BURST = 10 * DATAGRAM_SIZE
+
+
+class Window:
+    """Congestion window in bytes, adjusted once a round trip, and the pacing that spreads it over one.
+
+    A round trip that met no queue doubles it; else window * shortest / present round trip + QUEUE_SHARE (FAST TCP,
+    Wei et al. 2006, with gamma = 1): it settles where QUEUE_SHARE of its bytes wait somewhere. `GAIN` bounds both.
+    """
+
+    __slots__ = (
+        "_allowance", "_base", "_base_at", "_delivered", "_next_base", "_paced_at", "_recent", "_round_end",
+        "_round_rtt", "limited", "maximum", "size",
+    )  # fmt: skip
+
+    def __init__(self, now: float, maximum: int) -> None:
+        self.size = min(INITIAL_WINDOW, maximum)
+        self.maximum = maximum
+        self.limited = False
+        """The window kept something from being sent in this round trip."""
+        self._base = self._next_base = self._round_rtt = float("inf")
+        self._base_at = now
+        self._round_end = 0  # a round trip is over when a packet sent after its beginning is acknowledged
+        self._delivered = 0
+        self._recent = (0, 0)  # what the two round trips before delivered
+        self._allowance = float(PACING_BURST)
+        self._paced_at = now
+
+    def acknowledged(self, size: int, rtt: float | None, largest: int, next_number: int, now: float) -> None:
+        """`size` bytes arrived; `largest` is the highest number acknowledged, `next_number` the next one's."""
+        self._delivered += size
+        if rtt is not None:
+            self._round_rtt = min(self._round_rtt, rtt)
+        if largest >= self._round_end:
+            if self._round_rtt < float("inf"):
+                self._adjust(now)
+            self._round_end = next_number
+            self._recent = (self._recent[1], self._delivered)
+            self._delivered, self._round_rtt, self.limited = 0, float("inf"), False
+
+    def _adjust(self, now: float) -> None:
+        rtt = self._round_rtt
+        if now - self._base_at >= BASE_PERIOD:
+            self._base, self._next_base, self._base_at = self._next_base, float("inf"), now
+        self._next_base = min(self._next_base, rtt)
+        self._base = min(self._base, rtt)
+        if not self.limited:
+            return  # it was not put to the test
+        ratio, slack = NO_QUEUE
+        no_queue = rtt <= max(self._base * ratio, self._base + slack)
+        wanted = 2.0 * self.size if no_queue else self.size * self._base / rtt + QUEUE_SHARE
+        bound = GAIN * max(self._delivered, *self._recent)
+        self.size = int(max(MINIMUM_WINDOW, min(wanted, bound, self.maximum)))
+
+    def collapse(self) -> None:
+        """After an outage: begin again at the minimum, so that what waited does not come as a flood (7.6)."""
+        self.size = MINIMUM_WINDOW
+        self._recent = (0, 0)
+        self._allowance = min(self._allowance, float(MINIMUM_WINDOW))
+
+    def wait(self, now: float, rtt: float) -> float:
+        """Seconds until pacing lets another datagram go; 0 is now."""
+        rate = PACING_GAIN * self.size / max(rtt, GRANULARITY)
+        elapsed = now - self._paced_at
+        if elapsed > 0:
+            self._allowance = min(self._allowance + elapsed * rate, float(PACING_BURST))
+            self._paced_at = now
+        # Rounded up, or a timer may fire a hair too early and find nothing to do.
+        return 0.0 if self._allowance > 0 else -self._allowance / rate + 1e-4
+
+    def sent(self, size: int) -> None:
+        self._allowance -= size
