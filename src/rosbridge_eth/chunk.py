@@ -35,18 +35,18 @@ else:
     from compression import zstd
 
 VERSION: Final = 2
+#: The only flag: the last chunk of an orderly run.
 GOODBYE: Final = 1
-"""The only flag: the last chunk of an orderly run."""
 
 MAX_BODY: Final = 64 * 1024
 MAX_READERS: Final = 16
 MAX_RECORDS: Final = 1000
+#: Bytes of JSON Lines that a reader unpacks at most.
 MAX_PLAINTEXT: Final = 4 * 1024 * 1024
-"""Bytes of JSON Lines that a reader unpacks at most."""
+#: Bytes of a line that fits a chunk of its own whatever it holds.
 MAX_LINE: Final = 60 * 1024
-"""Bytes of a line that fits a chunk of its own whatever it holds."""
+#: The year 10000; a chunk is sealed before.
 MAX_TIME_MS: Final = 253_402_300_800_000
-"""The year 10000; a chunk is sealed before."""
 
 STREAM_SIZE: Final = 16
 KEY_SIZE: Final = 16
@@ -58,8 +58,8 @@ _FIXED = struct.Struct(">BB16sQ32sQI32sI32sB")
 MAX_HEADER: Final = _FIXED.size + MAX_READERS * _GRANT
 MAX_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_BODY
 
+#: zstd's level, chosen by benchmarks/bench_log.py.
 LEVEL: Final = 9
-"""zstd's level, chosen by benchmarks/bench_log.py: what it saves in gas above level 1 costs a few microseconds."""
 _MAGIC = b"\x28\xb5\x2f\xfd"
 _WINDOW = {int(zstd.DecompressionParameter.window_log_max): 22}  # 4 MiB
 
@@ -176,8 +176,8 @@ def _is_body(length: int) -> bool:
     return 0 < length - _GCM_TAG <= MAX_BODY - _GCM_TAG and (length - _GCM_TAG) % _BLOCK == 0
 
 
+#: Digest of the empty body, and root of the tree without leaves (RFC 9162, 2.1.1).
 _EMPTY = sm3.digest(b"")
-"""Digest of the empty body, and root of the tree without leaves (RFC 9162, 2.1.1)."""
 
 
 @dataclass(frozen=True, slots=True)

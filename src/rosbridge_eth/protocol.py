@@ -22,7 +22,8 @@ from rosbridge_eth.chunk import MAX_CHUNK
 MAX_WHY = 400
 
 _WHERE, _OFFER, _STORED, _CONFIRMED, _HOLD, _REFUSED = 0x01, 0x02, 0x11, 0x12, 0x13, 0x14
-_WHERE_FORM, _STORED_FORM, _PLACE_FORM = struct.Struct(">B16sQ32s"), struct.Struct(">B16s?Q32s"), struct.Struct(">B16sQ")
+_WHERE_FORM, _STORED_FORM = struct.Struct(">B16sQ32s"), struct.Struct(">B16s?Q32s")
+_PLACE_FORM = struct.Struct(">B16sQ")
 
 
 class ProtocolError(Exception):
