@@ -10,27 +10,47 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import os
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import version
 
 from rosbridge_eth import protocol
-from rosbridge_eth.capture import Capture, Captured, RawMessage, definition_line
-from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason
-from rosbridge_eth.channel.udp import UdpLoop
-from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.errors import NetworkError, StoreError
+from rosbridge_eth.capture import Capture, Captured, Decoder, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.channel import (
+    Client,
+    ClientConfig,
+    Connected,
+    Disconnected,
+    Event,
+    HandshakeFailed,
+    Message,
+    Mode,
+    Reason,
+)
+from rosbridge_eth.channel.udp import UdpLoop, client_socket
+from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.config import RobotConfig
+from rosbridge_eth.config.values import parse_address, time_text
+from rosbridge_eth.errors import ConfigError, NetworkError, StoreError
+from rosbridge_eth.home import RobotHome
+from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
-from rosbridge_eth.sources import Source
+from rosbridge_eth.sources import BagSource, Source, open_source
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.writer import LogWriter
+from smcrypto import sm2, x509
 
 log = logging.getLogger(__name__)
 
+SOFTWARE = f"rosbridge_eth {version('pysmcrypto')}"
 RING = 4096  # raw messages between the source's thread and the loop
 TAKE = 128  # raw messages captured before the network gets its turn again
 READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
@@ -89,8 +109,7 @@ class SenderStatistics:
 class Sender:
     """From the spool through the channel: asks what the server has of a stream, and sends what follows. Sans-IO.
 
-    begin_stream: called when the server refused the stream that is being written. on_server_time: is given the
-    server's authenticated time (seconds since 1970) at each new session.
+    on_server_time: is given the server's authenticated time (seconds since 1970) at each new session.
     """
 
     def __init__(
@@ -99,11 +118,12 @@ class Sender:
         spool: Spool,
         *,
         channel: str = "exchange",
-        begin_stream: Callable[[bytes], None] = lambda stream: None,
         on_server_time: Callable[[float], None] = lambda seconds: None,
     ) -> None:
         self._client, self._spool, self._channel = client, spool, channel
-        self._begin_stream, self._on_server_time = begin_stream, on_server_time
+        self._on_server_time = on_server_time
+        self.begin_stream: Callable[[bytes], None] = lambda refused: None
+        """Called when the server refused a stream, which may be the one that is being written."""
         self._said: dict[str, float] = {}  # reason for having no session -> when it was said
         self._stream: bytes | None = None  # being sent; None: the next one is to be asked about
         self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
@@ -195,7 +215,7 @@ class Sender:
                     "the server refuses chunk %d of stream %s: %s; %d chunks are set aside and a new stream begins",
                     number, stream.hex(), why, aside,
                 )
-                self._begin_stream(stream)
+                self.begin_stream(stream)
                 if stream == self._stream:
                     self._stream, self._asked = None, False
                     self._client.expecting(False)
@@ -230,6 +250,7 @@ class Robot:
         self._stop = threading.Event()
         self._source_ended = threading.Event()
         self._source_error: BaseException | None = None
+        self._decoders: dict[str, tuple[Decoder | None, int]] = {}  # by type: the one in force, how often it changed
         self._unspooled: deque[Chunk] = deque()
         self._spool_at = float("-inf")
         self._losses_at = float("-inf")
@@ -320,10 +341,8 @@ class Robot:
             raw = self._ring.popleft()
             record = self.capture.process(raw, time.time_ns(), self._synchronised)
             if record is not None:
-                self.writer.add(
-                    record.line, now, type_name=record.type_name,
-                    definition_line=lambda decoder=raw.decoder: definition_line(decoder),  # type: ignore[misc]
-                )
+                definition = partial(definition_line, raw.decoder)
+                self.writer.add(record.line, now, type_name=self._definition(raw), definition_line=definition)
                 self.captured += 1
                 self._on_captured(record)
         if len(self._ring) < RING // 2:
@@ -331,6 +350,14 @@ class Robot:
         if now - self._losses_at >= LOSSES_EVERY:
             self._losses_at = now
             self._add_losses(now)
+
+    def _definition(self, raw: RawMessage) -> str:
+        """What names the definition in force for the type: it is said again where publishers disagree about it."""
+        decoder, changes = self._decoders.get(raw.type_name, (None, 0))
+        if decoder is not raw.decoder:
+            changes += 1
+            self._decoders[raw.type_name] = (raw.decoder, changes)
+        return f"{raw.type_name} {changes}"
 
     def _add_losses(self, now: float) -> None:
         for line in self.capture.lost(self.source.dropped):
@@ -381,9 +408,10 @@ class Robot:
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender.statistics
         left = spool.unstored + len(self._unspooled)
+        topics = self.capture.statistics().values()
         lost = {
             "messages dropped because they came too fast": sum(self.source.dropped.values()),
-            "messages left out as too large or undecodable": self.capture.refused,
+            "messages left out as too large or undecodable": sum(t.refused + t.undecodable for t in topics),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }
@@ -398,3 +426,88 @@ class Robot:
         if not sender.sessions:
             return f"{line}: there was no session yet when it was stopped."
         return f"{line}: it was stopped before the server had them; the next start sends them."
+
+
+# Putting a robot together
+
+
+def certificate_clock(home: RobotHome) -> Callable[[], datetime]:
+    """The clock to check certificates against: many robots start in 1970 for want of a battery, so it is never before
+    the latest time that a server has proven to this robot."""
+    return lambda: datetime.fromtimestamp(max(time.time(), home.clock_floor()), UTC)
+
+
+def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
+    """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first."""
+    trust, keys = Trust(roots), []
+    for path in config.reader_files(home.readers):
+        found = read_certificates(path.read_bytes())
+        if len(found) != 2:
+            raise ConfigError(f"{path} holds {len(found)} certificates; a reader has two, signing and encryption")
+        signing, encryption = found
+        born = max(signing.not_before, encryption.not_before)
+        peer = trust.check(signing.to_der(), encryption.to_der(), role=Role.READER, at=born)
+        keys.append(peer.encryption_certificate.public_key)
+    return keys
+
+
+def open_robot(
+    home: RobotHome,
+    config: RobotConfig,
+    password: bytes,
+    *,
+    on_captured: Callable[[Captured], None] = lambda record: None,
+) -> Robot:
+    """The robot of this home, ready to `run`. Raises ConfigError, IdentityError, SourceError, StoreError."""
+    end = home.bridge()
+    identity, roots = load_identity(home.identity, password)
+    readers = reader_keys(config, home, roots)
+    settings, _ = config.source_and_why(os.environ)
+    source = open_source(settings.settings(), config.selection())
+    capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
+    for topic, decoders in source.decoders().items():
+        for decoder in decoders:
+            capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message
+    if isinstance(source, BagSource):
+        _say_what_is_outside(config.rules(), source.span)
+    place = Log(end.ledger, robot_id(identity.name))
+    key = identity.signing_key
+    spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
+    now = time.monotonic()
+    writer = LogWriter(
+        place, key, readers, previous=spool.last_digest, stream_line=stream_line(source.kind, SOFTWARE),
+        period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress, now=now,
+    )
+    client = Client(
+        ClientConfig(mode=Mode[config.channel.upper()]), identity, Trust(roots), end.server_name, now,
+        wall=certificate_clock(home),
+    )
+    sender = Sender(client, spool, channel=config.channel, on_server_time=home.raise_clock_floor)
+    socket, address = client_socket(config.server or parse_address(end.server_address))
+    loop = UdpLoop(client, socket, lambda event: sender.handle(event, time.monotonic()))
+    client.connect(address, now)
+    robot = Robot(
+        source=source, capture=capture, writer=writer, spool=spool, client=client, loop=loop, sender=sender,
+        on_captured=on_captured,
+    )
+    sender.begin_stream = robot.begin_stream
+    return robot
+
+
+def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> None:
+    """A rule that nothing in a recording can meet captures nothing, and would do so without a word."""
+    first, last = span
+    if first > last:
+        return  # the source has said that it replays nothing
+    for rule in rules:
+        key = (
+            "at" if rule.at_ns is not None and rule.at_ns > last
+            else "from" if rule.from_ns is not None and rule.from_ns > last
+            else "until" if rule.until_ns is not None and rule.until_ns <= first
+            else None
+        )  # fmt: skip
+        if key is not None:
+            log.warning(
+                "%s: `%s` leaves nothing to capture: what is replayed of the recording goes from %s to %s",
+                rule.topic, key, time_text(first), time_text(last),
+            )

@@ -1,0 +1,309 @@
+"""The server's processes: workers that share one UDP port, one submitter, and the monitor's HTTP where it is wanted.
+
+The parent opens the sockets and every secret once, checks chain and store before the port opens, and then only
+watches: what ends is started again. Children are forked, so no key travels through a pipe or an argument. They share
+nothing but the inbox.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from socket import AF_UNIX, SOCK_CLOEXEC, SOCK_DGRAM
+from socket import socket as Socket
+from types import FrameType
+
+from rosbridge_eth.administration import certificates_hash, server_trust
+from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
+from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.config import ServerConfig as Settings
+from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
+from rosbridge_eth.home import Deployment, OperatorHome
+from rosbridge_eth.identity import Identity
+from rosbridge_eth.inbox import Inbox, open_inbox
+from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.ledger.contract import Ledger
+from rosbridge_eth.ledger.submitter import Submitter
+from rosbridge_eth.logs import Trouble
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.server import Reception, Worker
+
+log = logging.getLogger(__name__)
+
+WATCH = 0.2  # seconds between looks at the children
+GRACE = 10.0  # seconds for children to end in good order
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0  # seconds before a process that ended is started again
+SHORT_LIFE = 5.0  # seconds; a process that lived longer began its work
+GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
+PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
+"""Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
+
+SUBMITTER, MONITOR = "submitter", "monitor"
+_FORK = multiprocessing.get_context("fork")
+
+
+@dataclass(frozen=True, slots=True)
+class Secrets:
+    """What the server needs and no file holds in clear."""
+
+    identity: Identity
+    keys: Keyring
+
+
+def worker_name(number: int) -> str:
+    return f"worker-{number}"
+
+
+def notify(state: str) -> None:
+    """Tell the service manager, where there is one (sd_notify(3)): READY=1, WATCHDOG=1, STOPPING=1."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return
+    with Socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC) as sock:
+        try:
+            # A leading @ is the abstract namespace, written as a zero byte.
+            sock.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
+        except OSError:
+            log.debug("the service manager is gone")
+
+
+def open_store(config: Settings, home: OperatorHome, *, read_only: bool = False) -> Inbox:
+    """The inbox that the configuration names. Raises StoreError."""
+    return open_inbox(
+        config.store.url, home=home.path, ledger=home.deployment().ledger, max_bytes=config.store.max_size,
+        max_bytes_per_robot=config.store.share, read_only=read_only,
+    )
+
+
+def open_reception(
+    number: int, config: Settings, identity: Identity, home: OperatorHome, registry: Registry, inbox: Inbox,
+    deployment: Deployment,
+) -> Reception:  # fmt: skip
+    """The door of one worker."""
+    limits = config.limits
+    server = Server(
+        ServerConfig(
+            modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number, max_connections=limits.connections,
+            handshake_share=limits.handshake_share, source_rate=limits.source_rate,
+        ),
+        identity,
+        server_trust(home, registry),
+        cookie_key(identity),
+        time.monotonic(),
+    )
+    return Reception(
+        server, inbox, deployment.ledger, allowed=registry.allows,
+        certificates=lambda name: certificates_hash(registry, name),
+    )
+
+
+class Supervisor:
+    """Runs a server until `stop`, SIGTERM, SIGINT or SIGHUP."""
+
+    def __init__(self, home: OperatorHome, config: Settings, secrets: Secrets) -> None:
+        self._home, self._config, self._secrets = home, config, secrets
+        self._deployment = home.deployment()
+        self._children: dict[str, BaseProcess] = {}
+        self._started_at: dict[str, float] = {}
+        self._due: dict[str, float] = {}  # processes that ended, and when they are started again
+        self._short_lives: dict[str, int] = {}
+        self._stop = threading.Event()
+        self._pid = os.getpid()
+
+    def stop(self) -> None:
+        self._stop.set()
+
+    def run(self, on_ready: Callable[[tuple[str, int]], None] = lambda address: None) -> None:
+        """Check, open the port, start the processes, watch them.
+
+        Raises BridgeError before the port is open, and ProcessError where a process does not come up however often
+        it is started. on_ready: called with the address that is listened on.
+        """
+        self._check()
+        counts = tempfile.mkdtemp(prefix="rosbridge-eth-")
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = counts  # read when prometheus_client is first imported
+        sockets = server_sockets(self._config.listen, self._config.workers)
+        tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
+        for number, sock in enumerate(sockets):
+            tasks[worker_name(number)] = self._worker_task(number, sock)
+        if self._config.monitor is not None:
+            tasks[MONITOR] = self._monitor_task(self._config.monitor, list(tasks))
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, self._on_signal)
+        try:
+            for name, task in tasks.items():
+                self._start(name, task)
+            host, port = sockets[0].getsockname()[:2]
+            on_ready((host, port))
+            notify("READY=1")
+            while not self._stop.wait(WATCH):
+                self._look(tasks, time.monotonic())
+                notify("WATCHDOG=1")
+        finally:
+            notify("STOPPING=1")
+            self._end()
+            for sock in sockets:
+                sock.close()
+            shutil.rmtree(counts, ignore_errors=True)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.stop()
+
+    def _check(self) -> None:
+        """The chain is the right one and the store keeps what it is given: only then may a robot be answered."""
+        Registry(self._home.registry).close()
+        Ledger.connect(self._config.chain.url, self._deployment).close()
+        inbox = open_store(self._config, self._home)
+        try:
+            inbox.check()
+        finally:
+            inbox.close()
+
+    def _start(self, name: str, task: Callable[[], None]) -> None:
+        process = _FORK.Process(target=_child, args=(task,), name=name, daemon=False)
+        process.start()
+        self._children[name] = process
+        self._started_at[name] = time.monotonic()
+        log.info("%s started, process %d", name, process.pid)
+
+    def _look(self, tasks: dict[str, Callable[[], None]], now: float) -> None:
+        for name, process in list(self._children.items()):
+            if process.is_alive() or name in self._due:
+                continue
+            lived = now - self._started_at[name]
+            pause = self._pause(name, process.exitcode, lived)
+            log.error(
+                "%s ended with exit code %s after %.0f s; it is started again in %.0f s",
+                name, process.exitcode, lived, pause,
+            )
+            self._due[name] = now + pause
+        for name, due in list(self._due.items()):
+            if now >= due:
+                del self._due[name]
+                self._start(name, tasks[name])
+
+    def _pause(self, name: str, code: int | None, lived: float) -> float:
+        """Seconds until it is started again. Raises ProcessError where that has no prospect."""
+        short = self._short_lives[name] = self._short_lives.get(name, 0) + 1 if lived < SHORT_LIFE else 0
+        if name != MONITOR and short >= GIVE_UP_AFTER and code not in PATIENT:
+            raise ProcessError(
+                f"{name} ends with exit code {code} as soon as it is started; the log says why."
+                " Robots keep their records until the server is back"
+            )
+        return float(min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** max(0, short - 1)))
+
+    def _end(self) -> None:
+        for process in self._children.values():
+            process.terminate()
+        deadline = time.monotonic() + GRACE
+        for name, process in self._children.items():
+            process.join(max(0.0, deadline - time.monotonic()))
+            if process.is_alive():
+                log.error("%s does not end; it is killed", name)
+                process.kill()
+                process.join()
+
+    # What runs in the children; each opens its own connections to store and chain.
+
+    def _worker_task(self, number: int, sock: Socket) -> Callable[[], None]:
+        def work() -> None:
+            from rosbridge_eth import metrics
+
+            name, registry, inbox = worker_name(number), Registry(self._home.registry), self._open_store()
+            reception = open_reception(
+                number, self._config, self._secrets.identity, self._home, registry, inbox, self._deployment
+            )
+            worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
+            beats = _Beats()
+
+            def show() -> None:
+                if beats.due():
+                    metrics.worker(name, worker, time.time())
+
+            worker.run(_terminated(self._pid), on_turn=show)
+
+        return work
+
+    def _submit(self) -> None:
+        from rosbridge_eth import metrics
+
+        stopped = threading.Event()
+        asked = _terminated(self._pid)
+        ledger = Ledger.connect(self._config.chain.url, self._deployment)
+        registry, inbox = Registry(self._home.registry), self._open_store()
+        submitter = open_submitter(self._config, ledger, inbox, registry, self._secrets.keys)
+        store = Trouble(log, "the store")
+        beats = _Beats()
+        while not asked():
+            wait = FIRST_PAUSE
+            try:
+                wait = submitter.turn(time.time())
+                store.now(None)
+            except StoreError as error:
+                store.now(str(error))
+            if beats.due():
+                metrics.submitter(submitter, inbox, registry, self._home.path, time.time())
+            stopped.wait(min(wait, FIRST_PAUSE))
+
+    def _monitor_task(self, address: tuple[str, int], expected: list[str]) -> Callable[[], None]:
+        from rosbridge_eth.metrics import Web
+
+        # The port is opened here, so that one that is taken is told at the start, before a robot is answered.
+        web = Web(address, expected)
+
+        def watch() -> None:
+            web.start()
+            log.info("/metrics, /healthz and /readyz at http://%s:%d", *web.address)
+            stopped = _terminated(self._pid)
+            while not stopped():
+                time.sleep(WATCH)
+            web.stop()
+
+        return watch
+
+    def _open_store(self) -> Inbox:
+        return open_store(self._config, self._home)
+
+
+class _Beats:
+    """Says once a second that the figures are due."""
+
+    def __init__(self) -> None:
+        self._next = float("-inf")
+
+    def due(self) -> bool:
+        now = time.monotonic()
+        if now < self._next:
+            return False
+        self._next = now + 1.0
+        return True
+
+
+def _terminated(parent: int) -> Callable[[], bool]:
+    """True once this process was asked to end, or `parent` is no more: nobody would end it then."""
+    asked = threading.Event()
+    signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
+    return lambda: asked.is_set() or os.getppid() != parent
+
+
+def _child(task: Callable[[], None]) -> None:
+    for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole group; the parent ends the children
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        task()
+    except BridgeError as error:
+        log.error("%s", error)
+        raise SystemExit(int(error.exit_code)) from error
+    except Exception as error:  # the end of the process: its last words belong into the log, as one event
+        log.critical("a defect ended this process", exc_info=True)
+        raise SystemExit(int(ExitCode.FAILED)) from error
+    raise SystemExit(int(ExitCode.OK))
