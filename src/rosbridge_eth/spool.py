@@ -1,0 +1,264 @@
+"""The robot's replica of its log: chunks from the moment they are sealed until they are confirmed on the chain.
+
+One SQLite table; `append` is one commit, and what it returned for survives kill -9 and the loss of power. When the
+spool is at its bound, or its disk is full, there is room for what is new at the expense of what is old:
+
+    1. chunks that the server has stored, and those set aside, as a whole
+    2. bodies of the oldest other ones; the robot signs that form of the chunk, and it is still sent
+    3. headers of the oldest without body: they take at most an eighth of the bound; the links of the log show it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from rosbridge_eth.chunk import Chunk, Log
+from rosbridge_eth.database import Database, DiskFull, InUse
+from rosbridge_eth.errors import StoreError
+
+_APPLICATION: Final = 0x52425350  # "RBSP"
+_STORED, _ASIDE, _BARE, _WHOLE = 2, 3, 4, 5
+"""States of a chunk: the server has it; it refused it; not stored, without and with a body.
+
+All take one byte in SQLite's format (0 and 1 take none), so that a change of state does not move the body.
+"""
+_BARE_SHARE: Final = 8  # of the bound, for chunks without body
+_SPARE: Final = 64 * 1024  # bytes removed beyond a chunk's own on a full disk, where pages count and not bytes
+
+_SCHEMA: Final = """
+-- position: the order of the log. number: 8 bytes, big-endian, which order as they count. chunk: as it travels.
+CREATE TABLE chunk (
+    position INTEGER PRIMARY KEY AUTOINCREMENT, stream BLOB NOT NULL, number BLOB NOT NULL, digest BLOB NOT NULL,
+    records INTEGER NOT NULL, size INTEGER NOT NULL, state INTEGER NOT NULL, chunk BLOB NOT NULL,
+    UNIQUE (stream, number)
+);
+CREATE INDEX chunk_by_state ON chunk (state, position);
+-- Sums over the chunks in each state, kept by the triggers.
+CREATE TABLE held (state INTEGER PRIMARY KEY, chunks INTEGER, records INTEGER, bytes INTEGER);
+INSERT INTO held VALUES (2, 0, 0, 0), (3, 0, 0, 0), (4, 0, 0, 0), (5, 0, 0, 0);
+CREATE TRIGGER added AFTER INSERT ON chunk BEGIN
+    UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
+    WHERE state = new.state;
+END;
+CREATE TRIGGER removed AFTER DELETE ON chunk BEGIN
+    UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
+    WHERE state = old.state;
+END;
+CREATE TRIGGER changed AFTER UPDATE ON chunk BEGIN
+    UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
+    WHERE state = old.state;
+    UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
+    WHERE state = new.state;
+END;
+-- One row: whose log, the newest header ever appended, and what was dropped since the spool was made.
+CREATE TABLE spool (
+    ledger BLOB, tk BLOB, last BLOB, dropped_bodies INTEGER, dropped_headers INTEGER, dropped_records INTEGER
+);
+"""
+_OLDEST: Final = "SELECT position, records, chunk FROM chunk WHERE state = ? ORDER BY position LIMIT 1"
+# The place in the log of a stream's newest chunk up to a number.
+_UP_TO: Final = "(SELECT position FROM chunk WHERE stream = ? AND number <= ? ORDER BY number DESC LIMIT 1)"
+
+
+class SpoolStatistics(NamedTuple):
+    """What is in the spool; unstored: chunks that the server does not have, as far as is known; aside: refused ones.
+
+    dropped_*: since the spool was made, what was removed although the server did not have it; records: those that
+    went with the bodies.
+    """
+
+    chunks: int
+    records: int
+    bytes: int
+    unstored: int
+    aside: int
+    dropped_bodies: int
+    dropped_headers: int
+    dropped_records: int
+
+
+class Spool:
+    """One robot's log, for one process and one thread. Every method may raise StoreError; then nothing was changed.
+
+    max_bytes: the bound on the chunks as they travel; the file takes about a tenth more. drop: gives the dropped
+    form of a chunk, signed (chunk.drop). StoreError if the file is another log's, or see database.Database.
+    """
+
+    def __init__(self, path: Path, log: Log, *, max_bytes: int, drop: Callable[[Chunk], Chunk]) -> None:
+        self._max_bytes, self._drop = max_bytes, drop
+        self._db = _open(path, exclusive=True)
+        try:
+            with self._db.errors():
+                row = self._db.one("SELECT ledger, tk, last FROM spool")
+            if row is None:
+                row = (*log, bytes(32))
+                self._db.write(lambda: self._db.run("INSERT INTO spool VALUES (?, ?, ?, 0, 0, 0)", row))
+            if row[:2] != log:
+                raise StoreError(
+                    f"the spool {path} is another robot's, or for another contract; what it holds is signed for that"
+                    " one alone: move it away"
+                )
+        except BaseException:
+            self.close()
+            raise
+        self.last_digest: bytes = row[2]
+        """Digest of the newest header ever appended, zeros if none: `previous` of the next chunk."""
+
+    def close(self) -> None:
+        self._db.close()
+
+    def append(self, chunk: Chunk) -> None:
+        """Add the next chunk of the log. DiskFull where even the removal of old ones makes no room for it."""
+        size = len(chunk.encoded)
+        if size > self._max_bytes:
+            raise StoreError(f"a chunk of {size} bytes is larger than the whole spool; raise [spool] max_size")
+        try:
+            self._db.write(lambda: self._append(chunk, size, spare=0))
+        except DiskFull:
+            self._db.write(lambda: self._append(chunk, size, spare=4 * size + _SPARE))
+        self.last_digest = chunk.header.digest
+
+    def _append(self, chunk: Chunk, size: int, *, spare: int) -> None:
+        held = self._bytes()
+        self._shrink(min(self._max_bytes - size, held - spare))
+        header, encoded = chunk.header, chunk.encoded
+        self._db.run(
+            "INSERT INTO chunk (stream, number, digest, records, size, state, chunk) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (header.stream, _sortable(header.number), header.digest, header.records, size,
+             _WHOLE if chunk.body else _BARE, encoded),
+        )  # fmt: skip
+        self._db.run("UPDATE spool SET last = ?", (header.digest,))
+
+    def _bytes(self, *states: int) -> int:
+        held = self._db.run("SELECT state, bytes FROM held").fetchall()
+        return sum(size for state, size in held if not states or state in states)
+
+    def _shrink(self, limit: int) -> None:
+        """Remove until no more than `limit` bytes are left, in the order that the module's docstring gives."""
+        while self._bytes() > max(0, limit):
+            many = self._bytes(_BARE) > self._max_bytes // _BARE_SHARE
+            for state in (_STORED, _ASIDE, _BARE, _WHOLE) if many else (_STORED, _ASIDE, _WHOLE, _BARE):
+                row = self._db.one(_OLDEST, (state,))
+                if row is not None:
+                    self._remove(state, *row)
+                    break
+
+    def _remove(self, state: int, position: int, records: int, encoded: bytes) -> None:
+        if state == _WHOLE:
+            dropped = self._drop(Chunk.parse(encoded)).encoded
+            self._db.run(
+                "UPDATE chunk SET state = ?, size = ?, chunk = ? WHERE position = ?",
+                (_BARE, len(dropped), dropped, position),
+            )
+        else:
+            self._db.run("DELETE FROM chunk WHERE position = ?", (position,))
+        if state != _STORED:
+            bodies = int(state != _BARE)
+            self._db.run(
+                "UPDATE spool SET dropped_bodies = dropped_bodies + ?, dropped_headers = dropped_headers + ?,"
+                " dropped_records = dropped_records + ?",
+                (bodies, int(state != _WHOLE), bodies * records),
+            )
+
+    def first_unconfirmed(self) -> tuple[bytes, int, bytes] | None:
+        """Stream, number and digest of the oldest chunk that is not set aside."""
+        oldest = "SELECT stream, number, digest FROM chunk WHERE state != ? ORDER BY position LIMIT 1"
+        return self._place(oldest, _ASIDE)
+
+    def next_stream(self, stream: bytes) -> tuple[bytes, int, bytes] | None:
+        """The same of the stream that begins after this one; of the oldest other one if this one is not here."""
+        return self._place(
+            "SELECT stream, number, digest FROM chunk WHERE state != ? AND stream != ? AND position >"
+            " (SELECT coalesce(max(position), 0) FROM chunk WHERE stream = ?) ORDER BY position LIMIT 1",
+            _ASIDE, stream, stream,
+        )  # fmt: skip
+
+    def _place(self, statement: str, *values: bytes | int) -> tuple[bytes, int, bytes] | None:
+        with self._db.errors():
+            row = self._db.one(statement, values)
+        return None if row is None else (row[0], int.from_bytes(row[1], "big"), row[2])
+
+    def following(self, stream: bytes, number: int | None, limit_bytes: int) -> list[Chunk]:
+        """The chunks of a stream above a number (None: from its first), in order; at least one, if there is any."""
+        chunks: list[Chunk] = []
+        after = b"" if number is None else _sortable(number)
+        with self._db.errors():
+            for (encoded,) in self._db.run(
+                "SELECT chunk FROM chunk WHERE stream = ? AND number > ? AND state != ? ORDER BY number",
+                (stream, after, _ASIDE),
+            ):
+                limit_bytes -= len(encoded)
+                if chunks and limit_bytes < 0:
+                    break
+                chunks.append(Chunk.parse(encoded))
+        return chunks
+
+    def stored(self, stream: bytes, number: int) -> None:
+        """The server has everything of this stream up to this number."""
+        upto = (stream, _sortable(number))
+        self._db.write(
+            lambda: self._db.run(
+                f"UPDATE chunk SET state = ? WHERE state IN (?, ?) AND stream = ? AND position <= {_UP_TO}",  # noqa: S608
+                (_STORED, _BARE, _WHOLE, stream, *upto),
+            ),
+            durable=False,
+        )
+
+    def confirmed(self, stream: bytes, number: int) -> None:
+        """This chunk and everything before it in the log leave the spool; what is set aside stays."""
+        self._db.write(
+            lambda: self._db.run(
+                f"DELETE FROM chunk WHERE state != ? AND position <= {_UP_TO}",  # noqa: S608
+                (_ASIDE, stream, _sortable(number)),
+            ),
+            durable=False,
+        )
+
+    def set_aside(self, stream: bytes, number: int) -> int:
+        """The server will never take this stream from this number on: it is not sent again. Returns how many."""
+        return self._db.write(
+            lambda: self._db.run(
+                "UPDATE chunk SET state = ? WHERE stream = ? AND number >= ? AND state != ?",
+                (_ASIDE, stream, _sortable(number), _ASIDE),
+            ).rowcount
+        )
+
+    def statistics(self) -> SpoolStatistics:
+        with self._db.errors():
+            return _statistics(self._db)
+
+
+def peek(path: Path) -> SpoolStatistics | None:
+    """What a spool holds, asked without owning it: nothing is made, mended or moved. None while its robot runs.
+
+    NothingThere if there is none, StoreError if it cannot be read.
+    """
+    db: Database | None = None
+    try:
+        db = _open(path, read_only=True)
+        with db.errors():
+            return _statistics(db)
+    except InUse:
+        return None
+    finally:
+        if db is not None:
+            db.close()
+
+
+def _open(path: Path, *, exclusive: bool = False, read_only: bool = False) -> Database:
+    return Database(
+        path, "spool", application=_APPLICATION, schema=_SCHEMA, wal_pages=128, exclusive=exclusive, read_only=read_only
+    )
+
+
+def _statistics(db: Database) -> SpoolStatistics:
+    held = {row[0]: row[1:] for row in db.run("SELECT state, chunks, records, bytes FROM held")}
+    dropped = db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool") or (0, 0, 0)
+    chunks, records, size = map(sum, zip(*held.values(), strict=True))
+    return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
+
+
+def _sortable(number: int) -> bytes:
+    return number.to_bytes(8, "big")
