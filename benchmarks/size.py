@@ -23,16 +23,17 @@ PARTS = {
     "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py"),
     "config": ("config", "config.py"),
     "identity, home, registry, bundle, errors": (
-        "identity.py", "home.py", "registry.py", "bundle.py", "errors.py", "passphrases.py", "__init__.py",
+        "identity.py", "home.py", "files.py", "registry.py", "administration.py", "bundle.py", "errors.py",
+        "passphrases.py", "__init__.py",
     ),
     "capture": ("capture",),
     "sources": ("sources",),
     "chunk": ("chunk.py", "writer.py", "protocol.py"),
     "channel": ("channel",),
-    "spool, inbox": ("spool.py", "inbox"),
+    "spool, inbox": ("spool.py", "database.py", "inbox"),
     "ledger": ("ledger",),
-    "robot, server": ("robot.py", "server.py", "robot", "server"),
-    "operations": ("metrics.py", "operations"),
+    "robot, server": ("robot.py", "sender.py", "server.py", "supervisor.py"),
+    "operations": ("metrics.py", "logs.py"),
     "reading": ("reading",),
 }
 """The rows of the design's table, by the first part of a file's path in the bridge's package."""
