@@ -150,7 +150,7 @@ def read_definition(type_name: str, text: str, format: Format = "msg") -> Defini
     if format == "idl":
         return check_types(name, _parse_idl(name, text))
     lines = [kept for line in text.splitlines() if (kept := _without_comment(line))]
-    return check_types(name, _parse_msg(name, lines), "\n".join(lines) + "\n")
+    return check_types(name, _parse_msg(name, lines), "".join(f"{line}\n" for line in lines))
 
 
 def check_types(type_name: str, types: Mapping[str, Fielddefs], text: str | None = None) -> Definition:
@@ -279,7 +279,7 @@ def write_text(type_name: str, fields: Mapping[str, Fielddefs], *, ros1: bool = 
             continue
         lines = [] if name == type_name else [_SEPARATOR, f"MSG: {_spelled(name, ros1)}"]
         sections += [*lines, *(f"{_spelled_type(description, ros1)} {field}" for field, description in fields[name])]
-    return "\n".join(sections) + "\n"
+    return "".join(f"{line}\n" for line in sections)
 
 
 def _spelled(name: str, ros1: bool) -> str:

@@ -40,6 +40,8 @@ def parse_idl(text: str, error: MakeError) -> dict[str, Fielddefs]:
     except (TypesysError, ValueError, KeyError, AssertionError, RecursionError) as reason:
         # rosbags quotes the whole text first; what it expected stands at the end.
         raise error(str(reason).rpartition("\n")[2] or type(reason).__name__) from None
+    if len(types) != tokens.count("struct"):
+        raise error("a struct is defined twice")
     return {name: fields for name, (_, fields) in types.items()}
 
 

@@ -1,6 +1,6 @@
 """Runs under a Python with ROS 1's message packages; prints, for each type, a message made at random and its values.
 
-One JSON object a line: type, definition (as a publisher sends it), raw (base64, by genpy), values (what genpy
+One JSON object a line: type, definition (as a publisher sends it), md5 sum, raw (base64, by genpy), values (what genpy
 reads back from the raw bytes, in the form of a record's data).
 """
 
@@ -78,6 +78,7 @@ def main():
             print(json.dumps({
                 "type": message_class._type,
                 "definition": message_class._full_text,
+                "md5": message_class._md5sum,
                 "raw": base64.b64encode(raw.getvalue()).decode(),
                 "values": in_a_record(message_class._type, read),
             }))  # fmt: skip

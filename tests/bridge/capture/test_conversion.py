@@ -8,12 +8,13 @@ import math
 from base64 import b64decode, b64encode
 from struct import pack
 
+import orjson
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosbridge_eth.capture import Conversion, DecodeError, Wire, decoder_for
-from rosbridge_eth.capture.conversion import FieldTooLarge, to_json
+from rosbridge_eth.capture.conversion import FieldTooLarge
 from rosbridge_eth.capture.messages import MAX_ELEMENTS
 from rosbridge_eth.capture.paths import EVERYTHING, parse_paths
 from rosbridge_eth.errors import ConfigError
@@ -90,7 +91,7 @@ def cdr(text: str, raw: bytes):
 def test_every_kind_of_field(kind, raw, expected):
     data = ros1(f"{kind} x", raw)
     assert data == {"x": expected}
-    assert json.loads(to_json(data)) == {"x": expected}
+    assert json.loads(orjson.dumps(data)) == {"x": expected}
     assert math.copysign(1, data["x"]) == math.copysign(1, expected) if isinstance(expected, float) else True
     assert type(data["x"]) is type(expected)
 
@@ -174,8 +175,8 @@ def test_elements_of_arrays_of_numbers_are_selected():
     assert ros1("float64[] ranges", raw, "ranges[*]") == {"ranges": [1.0, "NaN", 3.0]}
     element = ros1("uint8[] data", pack("<I", 2) + b"\x07\x08", "data[1]")
     assert element == {"data": {"1": 8}}
-    assert to_json(element) == '{"data":{"1":8}}'
-    assert to_json(ros1("bool[2] flags", b"\x01\x00", "flags[0]")) == '{"flags":{"0":true}}'
+    assert orjson.dumps(element) == b'{"data":{"1":8}}'
+    assert orjson.dumps(ros1("bool[2] flags", b"\x01\x00", "flags[0]")) == b'{"flags":{"0":true}}'
     assert ros1("byte[1] b", b"\xff", "b[0]") == {"b": {"0": -1}}
 
 
@@ -206,24 +207,50 @@ def test_a_field_above_the_limit_becomes_its_digest():
     for size in (limit, limit + 1):
         content = bytes(range(256)) * 4 + b"x" * (size - 1024)
         expected = b64encode(content).decode() if size == limit else {"sm3": sm3(content), "length": size}
-        assert ros1("uint8[] d", pack("<I", size) + content) == {"d": expected}
+        assert ros1("uint8[] d", pack("<I", size) + content, limit=limit) == {"d": expected}
     text = "ü" * 513
-    assert ros1("string s", string(text)) == {"s": {"sm3": sm3(text.encode()), "length": 1026}}
-    assert ros1("string s", string("ü" * 512)) == {"s": "ü" * 512}
+    assert ros1("string s", string(text), limit=limit) == {"s": {"sm3": sm3(text.encode()), "length": 1026}}
+    assert ros1("string s", string("ü" * 512), limit=limit) == {"s": "ü" * 512}
     numbers = pack("<129d", *range(129))
-    assert ros1("float64[] n", pack("<I", 129) + numbers) == {"n": {"sm3": sm3(numbers), "length": 1032}}
-    assert ros1("float64[] n", pack("<I", 128) + numbers[:1024]) == {"n": [float(n) for n in range(128)]}
+    assert ros1("float64[] n", pack("<I", 129) + numbers, limit=limit) == {"n": {"sm3": sm3(numbers), "length": 1032}}
+    assert ros1("float64[] n", pack("<I", 128) + numbers[:1024], limit=limit) == {"n": [float(n) for n in range(128)]}
     names = [f"name {n}" for n in range(200)]
     listed = json.dumps(names, separators=(",", ":")).encode()
     raw = pack("<I", 200) + b"".join(map(string, names))
-    assert ros1("string[] s", raw) == {"s": {"sm3": sm3(listed), "length": len(listed)}}
+    assert ros1("string[] s", raw, limit=limit) == {"s": {"sm3": sm3(listed), "length": len(listed)}}
 
 
 def test_only_selected_fields_are_measured():
     raw = pack("<I", 5000) + bytes(5000) + pack("<i", 3)
     assert ros1("uint8[] big\nint32 x", raw, "x", oversize="refuse") == {"x": 3}
     with pytest.raises(FieldTooLarge, match="big has 5000 bytes"):
-        ros1("uint8[] big\nint32 x", raw, oversize="refuse")
+        ros1("uint8[] big\nint32 x", raw, oversize="refuse", limit=1024)
+
+
+def test_a_scan_and_its_neighbours_are_whole_by_default():
+    ranges = [0.5 * n for n in range(360)]
+    assert ros1("float32[] ranges", pack("<I360f", 360, *ranges)) == {"ranges": ranges}
+    assert ros1("float64[36] covariance", pack("<36d", *range(36)))["covariance"] == list(map(float, range(36)))
+
+
+def test_an_array_whose_sum_overflows_is_one_of_finite_numbers():
+    largest = [1.7e308] * 3
+    assert ros1("float64[3] x", pack("<3d", *largest)) == {"x": largest}
+
+
+def test_arrays_within_arrays_and_every_kind_of_value_in_them():
+    text = (
+        "Row[] rows\n" + "=" * 80 + "\nMSG: pkg/Row\nCell[2] cells\nstring[] names\ntime[] at\nfloat32 f\n"
+        + "=" * 80 + "\nMSG: pkg/Cell\nstring s\nfloat64 d\nuint8[] b"
+    )
+    cell = string("c") + pack("<d", math.nan) + pack("<I", 1) + b"\x07"
+    row = cell * 2 + pack("<I", 2) + string("a") + string("b") + pack("<III", 1, 3, 4) + pack("<f", 0.5)
+    cells = [{"s": "c", "d": "NaN", "b": "Bw=="}] * 2
+    expected = {"cells": cells, "names": ["a", "b"], "at": [3_000_000_004], "f": 0.5}
+    assert ros1(text, pack("<I", 2) + row * 2) == {"rows": [expected] * 2}
+    assert ros1(text, pack("<I", 1) + row, "rows[*].cells[1].d", "rows[*].at") == {
+        "rows": [{"cells": {"1": {"d": "NaN"}}, "at": [3_000_000_004]}]
+    }
 
 
 def test_a_digest_of_a_big_endian_array_is_that_of_the_little_endian_one():
@@ -289,4 +316,4 @@ def test_any_bytes_are_a_message_or_undecodable(wire, raw):
         message = decoder.decode(raw)
     except DecodeError:
         return
-    json.loads(to_json(Conversion(decoder).convert(message)))
+    json.loads(orjson.dumps(Conversion(decoder).convert(message)))

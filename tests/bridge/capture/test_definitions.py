@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 
 import pytest
 from hypothesis import example, given
@@ -11,7 +12,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for, decoder_for_known, read_definition
-from rosbridge_eth.capture.definitions import MAX_DEPTH, MAX_FIELDS, MAX_TEXT, check_types
+from rosbridge_eth.capture.definitions import MAX_DEPTH, MAX_FIELDS, MAX_KEPT, MAX_TEXT, check_types, write_text
 
 SEPARATOR = "=" * 80
 
@@ -197,7 +198,20 @@ def test_fixed_arrays_may_not_multiply():
         read_definition("a/A", definition("B[1000] b", "a/B\nC[1000] c", "a/C\nstring[1000] s"))
 
 
+def test_types_that_double_at_every_level_are_refused():
+    # A few lines that would be written out as 2**30 fields.
+    levels = [("" if n == 0 else f"a/T{n}\n") + f"T{n + 1} a\nT{n + 1} b" for n in range(30)]
+    with pytest.raises(DefinitionError, match="comes to more than"):
+        read_definition("a/T0", definition(*levels, "a/T30\nint8 x"))
+    in_arrays = [level.replace(" a", "[] a").replace(" b", "[2] b") for level in levels]
+    with pytest.raises(DefinitionError):
+        read_definition("a/T0", definition(*in_arrays, "a/T30\nint8 x"))
+
+
 def test_sizes_are_bounded():
+    with pytest.raises(DefinitionError, match="without its comments"):
+        read_definition("a/A", f'int32 x\nstring S="{"s" * MAX_KEPT}"')
+    read_definition("a/A", f"int32 x\n# {'s' * MAX_KEPT}")
     with pytest.raises(DefinitionError, match="characters"):
         read_definition("a/A", "#" * (MAX_TEXT + 1))
     with pytest.raises(DefinitionError, match="fields"):
@@ -213,6 +227,32 @@ def test_a_constant_s_text_never_reaches_generated_code():
     assert decoder.decode(b"\x07\x00\x00\x00").x == 7
     assert not hasattr(sys, marker)
     assert decoder.definition.typesdict() == {"a/msg/Constants": ([], [("x", (Nodetype.BASE, ("int32", 0)))])}
+
+
+def test_a_definition_is_kept_without_its_comments_and_with_its_constants():
+    text = '# c\r\n\n int32 x # c\nstring S= a # b\nstring s # c\nbyte B=1 # c\n'
+    kept = read_definition("a/B", text).text
+    assert kept == "int32 x\nstring S= a # b\nstring s # c\nbyte B=1\n"
+    assert read_definition("a/B", kept).text == kept
+
+
+@pytest.mark.parametrize("store", [Stores.ROS1_NOETIC, Stores.ROS2_KILTED])
+def test_what_is_written_from_a_tree_is_read_as_that_tree(store):
+    ros1 = store is Stores.ROS1_NOETIC
+    known = get_typestore(store)
+    for type_name in known.fielddefs:
+        if ros1 and type_name.startswith("builtin_interfaces/"):
+            continue  # no messages there
+        try:
+            tree = read_definition(type_name, known.generate_msgdef(type_name, 1 if ros1 else 2)[0])
+        except DefinitionError as error:
+            assert "wstring" in str(error)
+            continue
+        text = write_text(type_name, tree.fields, ros1=ros1)
+        assert "/msg/" not in text
+        assert read_definition(type_name, text).fields == tree.fields
+        if ros1 and not any(known.fielddefs[name][0] for name in tree.fields):  # no constants
+            assert read_definition(type_name, text).md5 == tree.md5
 
 
 @given(st.text(alphabet=st.sampled_from("ab/_1=[]<>#\"'\\; \n\t\x00é=int32stringtimeMSG:@()"), max_size=200))
@@ -304,6 +344,8 @@ def test_idl_as_rosidl_generates_it():
         f"{SEPARATOR}\nIDL: pkg/msg/Inner\n{inner}\n"
     )
     read = read_definition("pkg/msg/Outer", text, "idl")
+    # In the log it is MSG, like any other.
+    assert read_definition("pkg/msg/Outer", read.text).fields == read.fields
     assert dict(read.fields["pkg/msg/Outer"]) == {
         "point": (name, "geometry_msgs/msg/Point"),
         "covariance": (array, ((base, ("float64", 0)), 36)),
@@ -344,13 +386,45 @@ def test_idl_as_rosidl_generates_it():
         "@" * 1000,
         "@a(" * 10_000,
         "é",
+        "module pkg { module msg { struct T { long x[1 << 99999999999999]; }; }; };",
+        "module pkg { module msg { struct T { long x[" + "(" * 200 + "1" + ")" * 200 + "]; }; }; };",
+        "module pkg { module msg { struct T { long x[" + "9" * 5000 + "]; }; }; };",
+        "module pkg { module msg { struct T { " + "a::" * 5000 + "b x; }; }; };",
+        "module pkg { module msg { " + "".join(f"typedef T{n + 1} T{n};" for n in range(2000)) + "struct T { T0 x; }; }; };",
+        "module pkg { module msg { struct T { " + "sequence<long, 4> x; " * 3000 + "}; }; };",
+        "module pkg { module msg { " + "const long A = 1;" * 2000 + "struct T { " + "long x[A];" * 1000 + "}; }; };",
+        "struct T { long x; }; " * 3000,
+        "const",
+        "const long",
+        "const ;",
+        "const long A = ;",
+        "module a { struct b { string<<5>> x; }; };",
+        "#" * 200_000 + "\n'",
+        "// " * 60_000 + "\n@",
     ],
-    ids=range(20),
+    ids=range(35),
 )
 @pytest.mark.timeout(10)
 def test_hostile_idl_is_refused_quickly(text):
+    started = time.process_time()
     with pytest.raises(DefinitionError):
         read_definition("pkg/T", text, "idl")
+    assert time.process_time() - started < 4
+
+
+TOKENS = ["module", "struct", "typedef", "const", "sequence", "string", "long", "double", "unsigned", "enum", "union",
+          "a", "b", "T", "::", "<", ">", "{", "}", "[", "]", ";", ",", "=", "1", "4096", "@", "(", ")", "<<", '"x"', "+"]
+
+
+@given(st.lists(st.sampled_from(TOKENS), max_size=60).map(" ".join), st.booleans())
+@pytest.mark.timeout(60)
+def test_any_arrangement_of_idl_is_a_definition_or_an_error(text, wrapped):
+    if wrapped:
+        text = f"module pkg {{ module msg {{ struct T {{ {text} }}; }}; }};"
+    try:
+        read_definition("pkg/T", text, "idl")
+    except DefinitionError:
+        pass
 
 
 @pytest.mark.timeout(10)

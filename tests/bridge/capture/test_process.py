@@ -1,4 +1,4 @@
-"""From raw message to record: what is counted, what is said, and that equal messages give equal bytes."""
+"""From raw message to line: what is counted, said and declared lost, and that equal messages give equal bytes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,29 @@ from struct import pack
 
 import pytest
 
-from rosbridge_eth.capture import Capture, CapturedRecord, Cause, RawMessage, TopicRule, Wire, decoder_for
-from rosbridge_eth.capture.process import MAX_CONVERSIONS, MAX_DATA
+from rosbridge_eth.capture import (
+    MAX_LINE,
+    Captured,
+    Cause,
+    LostLine,
+    MessageLine,
+    RawMessage,
+    TopicRule,
+    Wire,
+    decoder_for,
+    parse_line,
+)
+from rosbridge_eth.capture import Capture as AnyCapture
+from rosbridge_eth.capture.process import MAX_CONVERSIONS
 from rosbridge_eth.errors import ConfigError
 
 NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")
 BLOB = decoder_for(Wire.ROS1, "pkg/Blob", "uint8[] data\nint32 x")
+
+
+def Capture(rules, notify=None, **options):  # noqa: N802 - as the class
+    said = {} if notify is None else {"notify": notify}
+    return AnyCapture(rules, source_kind="sim", **said, **options)
 
 
 def number(value: int, at: int = 0, topic: str = "/n") -> RawMessage:
@@ -23,35 +40,38 @@ def blob(size: int, topic: str = "/b") -> RawMessage:
 
 
 def test_a_record_says_what_when_and_how_it_was_captured():
-    capture = Capture([TopicRule("/n", delivery="latest")])
-    record = capture.process(number(5, at=7), wall_ns=8, mono_ns=9, clock_synchronised=True)
-    assert record == CapturedRecord("/n", "pkg/msg/Number", 7, 8, 9, True, {"x": 5}, "latest")
-    assert CapturedRecord.from_json(record.to_json()) == record
+    captured = Capture([TopicRule("/n")]).process(number(5, at=7), wall_ns=8, clock_synchronised=True)
+    line = (
+        b'{"topic":"/n","type":"pkg/msg/Number","source":"sim","received_ns":7,"captured_ns":8,"clock":true,'
+        b'"data":{"x":5}}'
+    )
+    assert captured == Captured("/n", "pkg/msg/Number", 7, line, NUMBER, {"x": 5})
+    assert parse_line(line) == MessageLine("/n", "pkg/msg/Number", "sim", 7, 8, True, {"x": 5})
 
 
 def test_equal_messages_give_equal_bytes():
-    encoded = [Capture([TopicRule("/n")]).process(number(5), 1, 2).to_json() for _ in range(2)]
-    assert encoded[0] == encoded[1]
+    lines = [Capture([TopicRule("/n")]).process(number(5), 1).line for _ in range(2)]
+    assert lines[0] == lines[1]
 
 
 def test_a_topic_without_a_rule_is_not_captured_nor_counted():
     capture = Capture([TopicRule("/other")])
-    assert capture.process(number(1), 0, 0) is None
+    assert capture.process(number(1), 0) is None
     assert capture.statistics() == {}
 
 
 def test_everything_seen_is_counted_once():
     notices = []
-    rules = [TopicRule("/n", rate=1), TopicRule("/b", oversize="refuse"), TopicRule("/d")]
+    rules = [TopicRule("/n", rate=1), TopicRule("/b", oversize="refuse", limit=1024), TopicRule("/d", limit=1024)]
     capture = Capture(rules, notices.append)
     for tick in range(10):
-        capture.process(number(tick, at=tick * 10**8), 0, 0)
+        capture.process(number(tick, at=tick * 10**8), 0)
     for size in (10, 2000, 3000):
-        capture.process(blob(size), 0, 0)
+        capture.process(blob(size), 0)
     for size in (10, 2000, 3000):
-        capture.process(blob(size, "/d"), 0, 0)
+        capture.process(blob(size, "/d"), 0)
     for _ in range(3):
-        assert capture.process(RawMessage("/n", "pkg/msg/Number", 10**12, b"", NUMBER), 0, 0) is None
+        assert capture.process(RawMessage("/n", "pkg/msg/Number", 10**12, b"", NUMBER), 0) is None
     counts = capture.statistics()
     assert (counts["/n"].seen, counts["/n"].captured, counts["/n"].not_due, counts["/n"].undecodable) == (13, 1, 9, 3)
     assert (counts["/b"].captured, counts["/b"].refused, counts["/b"].fields_digested) == (1, 2, 0)
@@ -67,29 +87,54 @@ def test_everything_seen_is_counted_once():
     assert "data has 2000 bytes" in notices[0].text
 
 
-def test_a_record_that_could_not_be_sealed_is_refused():
-    text = "\n".join(f"string s{i}" for i in range(40))
-    decoder = decoder_for(Wire.ROS1, "pkg/Wordy", text)
+def test_what_is_not_in_the_log_is_declared_once():
+    rules = [TopicRule("/n", rate=1), TopicRule("/b", oversize="refuse", limit=1024), TopicRule("/d", limit=1024)]
+    capture = Capture(rules, lambda notice: None)
+    assert capture.lost({}) == []
+    for size in (10, 2000, 3000):
+        capture.process(blob(size), 0)
+        capture.process(blob(size, "/d"), 0)  # a digest is no loss
+    for tick in range(3):
+        capture.process(number(tick), 0)  # nor is what is not due
+    capture.process(RawMessage("/n", "pkg/msg/Number", 10**12, b"", NUMBER), 0)
+    lost = [parse_line(line) for line in capture.lost({"/b": 5, "/quiet": 0})]
+    assert sorted(lost, key=lambda line: line.lost) == [
+        LostLine(1, "/n", "undecodable"), LostLine(2, "/b", "field_too_large"), LostLine(5, "/b", "dropped"),
+    ]  # fmt: skip
+    assert capture.lost({"/b": 5}) == []
+    capture.process(blob(2000), 0)
+    assert capture.lost({"/b": 6, "/c": 1}) == [
+        b'{"lost":1,"topic":"/b","why":"dropped"}', b'{"lost":1,"topic":"/c","why":"dropped"}',
+        b'{"lost":1,"topic":"/b","why":"field_too_large"}',
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("moment", [-1, 2**63, 10**30])
+def test_a_receive_time_that_is_none_costs_its_message_only(moment):
     notices = []
-    capture = Capture([TopicRule("/w")], notices.append)
-    for words, fits in ((700, True), (1000, False)):
-        raw = (pack("<I", words) + b"x" * words) * 40
-        record = capture.process(RawMessage("/w", "pkg/msg/Wordy", 0, raw, decoder), 0, 0)
-        assert (record is not None) is fits
-        assert record is None or len(record.to_json()) <= MAX_DATA + 1024
-    assert [notice.cause for notice in notices] == [Cause.RECORD_TOO_LARGE]
+    capture = Capture([TopicRule("/n")], notices.append)
+    assert capture.process(number(1, at=moment), 0) is None
+    assert capture.process(number(1, at=5), 0) is not None
+    assert [notice.cause for notice in notices] == [Cause.UNDECODABLE]
 
 
-def test_the_bound_on_a_record_is_in_bytes_of_its_json():
+def test_the_bound_on_a_line_is_in_bytes_and_exact():
     decoder = decoder_for(Wire.ROS1, "pkg/Words", "string[] s")
-    frame = len('{"s":[""]}')
+    frame = len(
+        '{"topic":"/w","type":"pkg/msg/Words","source":"sim","received_ns":0,"captured_ns":0,"clock":false,'
+        '"data":{"s":[""]}}'
+    )
     for letter, size in (("x", 1), ("ü", 2)):
-        for letters, fits in ((MAX_DATA - frame) // size, True), ((MAX_DATA - frame) // size + 1, False):
+        most = (MAX_LINE - frame) // size
+        for letters, fits in ((most, True), (most + 1, False)):
             encoded = (letter * letters).encode()
             raw = pack("<II", 1, len(encoded)) + encoded
-            capture = Capture([TopicRule("/w", limit=1 << 20)], lambda notice: None)
-            record = capture.process(RawMessage("/w", "pkg/msg/Words", 0, raw, decoder), 0, 0)
-            assert (record is not None) is fits, (letter, letters)
+            notices = []
+            capture = Capture([TopicRule("/w", limit=1 << 20)], notices.append)
+            captured = capture.process(RawMessage("/w", "pkg/msg/Words", 0, raw, decoder), 0)
+            assert (captured is not None) is fits, (letter, letters)
+            assert captured is None or MAX_LINE - 1 <= len(captured.line) <= MAX_LINE
+            assert [notice.cause for notice in notices] == [] if fits else [Cause.RECORD_TOO_LARGE]
 
 
 def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
@@ -97,16 +142,16 @@ def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
     with pytest.raises(ConfigError, match="has no field 'y'"):
         capture.check("/n", NUMBER)
     with pytest.raises(ConfigError, match="has no field 'y'"):
-        capture.process(number(1), 0, 0)
+        capture.process(number(1), 0)
 
 
 def test_a_live_publisher_of_a_type_without_the_field_does_not_end_the_robot():
     notices = []
     capture = Capture([TopicRule("/x", fields=("data",))], notices.append, live=True)
-    assert capture.process(blob(1, "/x"), 0, 0) is not None
-    assert capture.process(number(1, topic="/x"), 0, 0) is None
-    assert capture.process(number(2, topic="/x"), 0, 0) is None
-    assert capture.process(blob(1, "/x"), 0, 0) is not None
+    assert capture.process(blob(1, "/x"), 0) is not None
+    assert capture.process(number(1, topic="/x"), 0) is None
+    assert capture.process(number(2, topic="/x"), 0) is None
+    assert capture.process(blob(1, "/x"), 0) is not None
     assert [notice.cause for notice in notices] == [Cause.FIELD_MISSING]
     assert "has no field 'data'" in notices[0].text
     statistics = capture.statistics()["/x"]
@@ -118,26 +163,26 @@ def test_definitions_that_come_and_go_are_not_kept_for_ever():
     for number_ in range(50):
         decoder = decoder_for(Wire.ROS1, "pkg/Number", f"int32 x{number_}")
         raw = RawMessage("/x", "pkg/msg/Number", 0, pack("<i", number_), decoder)
-        assert capture.process(raw, 0, 0).data == {f"x{number_}": number_}
+        assert capture.process(raw, 0).data == {f"x{number_}": number_}
     (topic,) = capture._topics.values()
     assert len(topic.conversions) <= MAX_CONVERSIONS
-    assert capture.process(number(7, topic="/x"), 0, 0).data == {"x": 7}
+    assert capture.process(number(7, topic="/x"), 0).data == {"x": 7}
 
 
 def test_types_may_change_under_a_topic():
     capture = Capture([TopicRule("/**")])
-    assert capture.process(number(1, topic="/x"), 0, 0).data == {"x": 1}
-    assert capture.process(blob(1, "/x"), 0, 0).data == {"data": "AA==", "x": 1}
+    assert capture.process(number(1, topic="/x"), 0).data == {"x": 1}
+    assert capture.process(blob(1, "/x"), 0).data == {"data": "AA==", "x": 1}
 
 
 def test_it_is_finished_when_no_rule_can_capture_more():
     capture = Capture([TopicRule("/n", once=True), TopicRule("/m", once=True)])
     assert not capture.finished
-    capture.process(number(1), 0, 0)
+    capture.process(number(1), 0)
     assert not capture.finished
-    capture.process(number(1, topic="/m"), 0, 0)
+    capture.process(number(1, topic="/m"), 0)
     assert capture.finished
-    assert capture.process(number(1), 0, 0) is None
+    assert capture.process(number(1), 0) is None
     assert not Capture([TopicRule("/*", once=True)]).finished
 
 
