@@ -15,9 +15,10 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import ChainError
@@ -71,7 +72,8 @@ class DataEvent(NamedTuple):
     account: str
 
 
-class RegistrationEvent(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class RegistrationEvent:
     """A registration or revocation that holds from chunk number `index`; `certificates` is b'' for the latter."""
 
     account: str
@@ -109,6 +111,17 @@ class Fees(NamedTuple):
 
     def limited(self, limit: int) -> Fees:
         return Fees(min(self.highest, limit), None if self.tip is None else min(self.tip, limit))
+
+
+class Place(Protocol):
+    """Where a contract was deployed: hash of the chain's first block and address in 0x-hex."""
+
+    @property
+    def chain_id(self) -> int: ...
+    @property
+    def genesis(self) -> str: ...
+    @property
+    def contract(self) -> str: ...
 
 
 class Signed(NamedTuple):
@@ -149,7 +162,7 @@ def artifact() -> dict[str, Any]:
 class Ledger:
     """The contract at an address, on a node. Made by `connect` or `deploy`; asks nothing until it is used."""
 
-    def __init__(self, where: Any, contract: str, *, timeout: float = 10.0) -> None:
+    def __init__(self, where: Any, contract: str, place: Place | None = None, *, timeout: float = 10.0) -> None:
         """where: a URL, or a provider of web3 (nodes.embedded). timeout: seconds for one answer."""
         from web3 import HTTPProvider, Web3
         from web3.middleware import ExtraDataToPOAMiddleware
@@ -165,21 +178,40 @@ class Ledger:
         self.w3 = Web3(where, middleware=[ExtraDataToPOAMiddleware])
         with self._asking():
             self.contract: str = Web3.to_checksum_address(contract)
+        self._place, self._checked = place, False
         self._contract: Any = self.w3.eth.contract(address=self.w3.to_checksum_address(contract), abi=artifact()["abi"])
 
     @staticmethod
-    def connect(where: Any, contract: str, *, timeout: float = 10.0) -> Ledger:
-        """The contract at `contract`, on the node at `where`; http and https."""
-        return Ledger(where, contract, timeout=timeout)
+    def connect(where: Any, place: Place, *, timeout: float = 10.0) -> Ledger:
+        """A contract that was deployed before, on the node at `where` (http or https). `check` asks the node."""
+        return Ledger(where, place.contract, place, timeout=timeout)
 
     @staticmethod
-    def deploy(where: Any, operator: LocalAccount, *, wait: float = 120.0) -> Ledger:
+    def deploy(where: Any, operator: LocalAccount, *, wait: float = 120.0) -> tuple[Ledger, Receipt]:
         """Create the contract; `operator` pays and becomes its operator. Waits until a block holds it."""
         nowhere = Ledger(where, "0x" + "00" * 20)
         receipt = nowhere._send_and_wait(operator, None, bytes.fromhex(artifact()["bytecode"]), 0, 2_500_000, wait)
         if receipt.contract is None:
             raise ChainError(f"{nowhere.url} mined the deployment but names no contract address")
-        return Ledger(where, receipt.contract)
+        return Ledger(where, receipt.contract), receipt
+
+    def check(self) -> None:
+        """ChainError unless the node has this contract, on the chain where it was deployed. Asks the node once."""
+        if self._checked:
+            return
+        with self._asking():
+            chain_id = self.w3.eth.chain_id
+        here, right = (chain_id, self.block(0).hash), (self.chain_id, self.genesis)
+        if here != right:
+            raise ChainError(
+                f"{self.url} is another chain: id {here[0]} and first block {here[1].hex()}, "
+                f"not {right[0]} and {right[1].hex()}; name a node of the chain that was set up"
+            )
+        if not self.code:
+            raise ChainError(f"there is no contract at {self.contract} on {self.url}; the node may be behind")
+        if self.code.hex() != artifact()["deployedBytecode"]:
+            raise ChainError(f"the contract at {self.contract} on {self.url} is not RobotLedger of this edition")
+        self._checked = True
 
     def close(self) -> None:
         with self._asking():
@@ -191,30 +223,26 @@ class Ledger:
 
     @cached_property
     def chain_id(self) -> int:
+        if self._place is not None:
+            return self._place.chain_id
         with self._asking():
             return _natural(self.w3.eth.chain_id)
 
     @cached_property
     def genesis(self) -> bytes:
         """The hash of block 0."""
-        return self.block(0).hash
+        return self.block(0).hash if self._place is None else bytes.fromhex(self._place.genesis.removeprefix("0x"))
 
     @property
     def ledger(self) -> bytes:
         """What a robot's signatures name this contract on this chain by."""
         return ledger_id(self.chain_id, self.genesis, bytes.fromhex(self.contract[2:]))
 
-    def require(self, chain_id: int, genesis: bytes) -> None:
-        """ChainError unless the node is of this chain and has the contract."""
-        if (self.chain_id, self.genesis) != (chain_id, genesis):
-            raise ChainError(
-                f"{self.url} is another chain: id {self.chain_id} and first block {self.genesis.hex()[:16]}, "
-                f"expected {chain_id} and {genesis.hex()[:16]}; name a node of the chain that was set up"
-            )
+    @property
+    def code(self) -> bytes:
+        """What is at the contract's address."""
         with self._asking():
-            code = bytes(self.w3.eth.get_code(self._contract.address))
-        if not code:
-            raise ChainError(f"there is no contract at {self.contract} on {self.url}; is the node behind?")
+            return bytes(self.w3.eth.get_code(self._contract.address))
 
     def block(self, number: int | str = "latest") -> Block:
         with self._asking():
@@ -305,18 +333,23 @@ class Ledger:
     def newest_data(self, tk: bytes, last_block: int) -> Iterator[DataEvent]:
         """The robot's batches from `last_block` back, newest first, by their links; `last_block` holds one.
 
-        ChainError where a link leads to a block without one.
+        Asked for in ranges that double while they are not refused. ChainError where a link leads nowhere.
         """
-        block = last_block
+        block, span, most = last_block, 1, SPAN
         while block > 0:
-            found = self._data(tk, block, block)
-            if not found:
-                raise ChainError(f"{self.url} has no batch of this robot in block {block}, where there must be one")
+            try:
+                found = self._data(tk, max(1, block - span + 1), block)
+            except TooMuch:
+                if span == 1:
+                    raise
+                span = most = span // 2
+                continue
+            if not found or found[-1].block != block:
+                raise ChainError(f"{self.url} has no batch of this robot in block {block}, where one must be")
             yield from reversed(found)
-            previous = found[0].previous_block
-            if previous >= block:
-                raise ChainError(f"{self.url}: the batch before that of block {block} is said to be in {previous}")
-            block = previous
+            if found[0].previous_block >= block:
+                raise ChainError(f"{self.url} names a batch before that of block {block} which is not before it")
+            block, span = found[0].previous_block, min(2 * span, most)
 
     def registrations(self, tk: bytes, standing: Standing) -> list[RegistrationEvent]:
         """All of the robot's registrations and revocations up to `standing`, oldest first, by their links."""
@@ -342,7 +375,7 @@ class Ledger:
             logs: Any = self.w3.eth.get_logs(
                 {
                     "address": self._contract.address,
-                    "topics": [["0x" + topic.hex() for topic in events], "0x" + tk.hex()],  # type: ignore[list-item]
+                    "topics": [["0x" + topic.hex() for topic in events], "0x" + tk.hex()],
                     "fromBlock": start,
                     "toBlock": end,
                 }
@@ -510,7 +543,7 @@ class Ledger:
 
     def _revert(self, data: Any) -> Reverted | None:
         """The contract's own error, where `data` holds one."""
-        from eth_abi import decode
+        from eth_abi.abi import decode
         from eth_abi.exceptions import DecodingError
         from web3 import Web3
 

@@ -23,7 +23,7 @@ class EmbeddedChain(EthereumTesterProvider):
 
     def __init__(self, fund: Mapping[str, int] | None = None, *, gas_limit: int = 30_000_000) -> None:
         """fund: wei of these accounts at the beginning."""
-        from eth_tester import EthereumTester, PyEVMBackend
+        from eth_tester import EthereumTester, PyEVMBackend  # type: ignore[import-untyped, unused-ignore]
         from eth_utils.address import to_canonical_address
 
         wealth = {_CALLER: 10**27} | dict(fund or {})
@@ -42,7 +42,7 @@ class EmbeddedChain(EthereumTesterProvider):
 
     def make_request(self, method: Any, params: Any) -> Any:
         """As a node answers: failures are errors of JSON-RPC, a revert with its data."""
-        from eth_tester.exceptions import TransactionFailed
+        from eth_tester.exceptions import TransactionFailed  # type: ignore[import-untyped, unused-ignore]
 
         with self._lock:
             try:
