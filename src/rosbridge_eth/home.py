@@ -11,6 +11,7 @@ An operator's home (made by `init`); it holds no reader's key and no robot's:
     accounts.json        the seed of all Ethereum accounts, under the same passphrase
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
+    reader.toml          the same for readers, to be put beside their keys
     inbox.sqlite         the server's replica of the robots' logs
     bundles/             what `register` writes for robots
 
@@ -69,13 +70,12 @@ def ledger_of(chain_id: int, genesis: str, contract: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Deployment:
-    """A contract on a chain; `block` is the one that holds its creation. Hashes and address are 0x-hex."""
+    """A contract on a chain, in `block` or before it. The first block's hash and the address are 0x-hex."""
 
     chain_id: int
     genesis: str
     contract: str
     block: int
-    code_hash: str
 
     @property
     def ledger(self) -> bytes:
@@ -176,6 +176,7 @@ class OperatorHome:
         self.accounts = path / "accounts.json"
         self.registry = path / "registry.sqlite"
         self.deployment_file = path / "deployment.json"
+        self.reader_config = path / "reader.toml"
         self.inbox = path / "inbox.sqlite"
         self.bundles = path / "bundles"
         self.submitter_lock = path / "submitter.lock"
@@ -183,7 +184,7 @@ class OperatorHome:
     @property
     def ca(self) -> Path:
         """The folder of the CA's key and certificate; `init` may have been given another than ours."""
-        return Path(home_of(self.path).get("ca") or self.path / "ca")
+        return self.path / home_of(self.path).get("ca", "ca")
 
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""

@@ -490,11 +490,14 @@ class LimitsConfig(Section):
 
     connections: Sessions.
 
-    handshakes: Handshakes per second that one address may fail, and 40 times as many at once.
+    handshake_share: Share of time that handshakes may take.
+
+    source_rate: Handshakes per second that one address may fail, and 40 times as many at once.
     """
 
     connections: int = Field(default=4096, ge=1)
-    handshakes: float = Field(default=10.0, gt=0)
+    handshake_share: float = Field(default=0.5, gt=0, le=1)
+    source_rate: float = Field(default=10.0, gt=0)
 
 
 class ServerConfig(Section):

@@ -1,0 +1,503 @@
+"""What an operator does: make a home, deploy the contract, certify robots and readers, end their rights, look after
+the home.
+
+Functions on homes, a CA, a keyring, a Ledger and an Inbox; the command line asks for passphrases and prints. Every
+step that spans the registry, a file and the chain is ordered so that it can be run again after a crash between any two.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import shutil
+import socket
+import sqlite3
+import struct
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from rosbridge_eth import identity as ids
+from rosbridge_eth.bundle import Bundle, Request
+from rosbridge_eth.chunk import MAX_READERS, robot_id
+from rosbridge_eth.config import Address, ServerConfig, load_server_config, parse_config
+from rosbridge_eth.config.values import parse_address
+from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
+from rosbridge_eth.files import require_private, write_atomically
+from rosbridge_eth.home import (
+    ETH,
+    BridgeEnd,
+    Deployment,
+    HomeKind,
+    OperatorHome,
+    ReaderHome,
+    RobotHome,
+    home_of,
+    kind_of,
+    make_home,
+    require_empty,
+)
+from rosbridge_eth.identity import CertificateAuthority, Role, check_name
+from rosbridge_eth.inbox import Inbox
+from rosbridge_eth.ledger import Keyring, Ledger, Standing
+from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
+from rosbridge_eth.registry import OWNER, Registry
+from smcrypto import InvalidKey, sm2
+
+OPERATOR = "operator"  # what the treasury's account is called
+ACCOUNTS_TRIED = 1000
+HANDING_OVER = 2.0  # seconds after which no session of a name out of force is left: the server looks every second
+SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
+LAST_WRITES = 20.0  # the same, where a robot is revoked and not replaced: then its right ends all the same
+_ANYWHERE = {"0.0.0.0": socket.AF_INET, "::": socket.AF_INET6}  # noqa: S104 - what is looked for
+_SIOCGIFADDR = 0x8915  # netdevice(7)
+
+
+# The home
+
+
+def own_address(listen: Address) -> Address:
+    """Where others reach a socket that listens there: `listen`, or for any address the one of the default route, that
+    of another interface, and last the loopback's."""
+    family = _ANYWHERE.get(listen.host)
+    if family is None:
+        return listen
+    loopback, far = ("127.0.0.1", "192.0.2.1") if family == socket.AF_INET else ("::1", "2001:db8::1")
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((far, 9))  # sends nothing; chooses the route
+            return listen._replace(host=probe.getsockname()[0])
+        except OSError:
+            for _, name in socket.if_nameindex() if family == socket.AF_INET else ():
+                try:
+                    answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                except OSError:
+                    continue  # an interface without an address
+                host = socket.inet_ntoa(answer[20:24])
+                if not host.startswith("127."):
+                    return listen._replace(host=host)
+    return listen._replace(host=loopback)
+
+
+def server_toml(listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None) -> str:
+    """The first server.toml of a home: what differs from the defaults, and where the rest is described."""
+    lines = [
+        "# Settings of the server; docs/configuration.md describes every key.",
+        f'listen = "{listen}"',
+        f'public = "{public}"  # the address robots are given' if public.port else '# public = "HOST:PORT"',
+        f'name = "{name}"',
+        *([f'passphrase_file = "{passphrase_file.absolute()}"'] if passphrase_file else []),
+        "",
+        "[chain]",
+        f'url = "{chain_url}"',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def init_home(
+    home: OperatorHome, passphrase: bytes, *, reader: ReaderHome, reader_passphrase: bytes, now: datetime,
+    listen: str = "0.0.0.0:7410", public: str | None = None, chain_url: str = "http://127.0.0.1:8545",
+    server: str = "server", ca: Path | None = None, ca_passphrase: bytes | None = None, keys: Keyring | None = None,
+    passphrase_file: Path | None = None,
+) -> Keyring:
+    """Make an operator's home: CA, server's identity, seed of the accounts; and the reader `owner` in its own folder.
+
+    ca: the folder of the CA, which is made there unless it holds one (`ca.key.pem`, `ca.crt.pem`); without it, in the
+    home. ca_passphrase: where it differs. keys: instead of a new seed. passphrase_file: is named in server.toml.
+    """
+    require_empty(home.path)
+    require_empty(reader.path)
+    try:
+        door = parse_address(listen)
+        text = server_toml(
+            door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file
+        )
+    except ValueError as error:
+        raise ConfigError(f"the address {error}") from error
+    parse_config(ServerConfig, text, home.config)
+    for folder in (home.path, home.bundles, home.readers):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    authority = _make_ca(ca or home.path / "ca", ca_passphrase or passphrase, now)
+    write_atomically(home.ca_certificate, authority.certificate.to_pem())
+    with Registry(home.registry, new=True) as registry:
+        identity = ids.enrol(authority, Role.SERVER, server, at=now)
+        ids.save_identity(home.server, identity, [authority.certificate], passphrase)
+        registry.enrol(identity.public, now)
+        _make_reader(home, reader, OWNER, authority, reader_passphrase, now, registry)
+    keys = keys or Keyring.create()
+    keys.save(home.accounts, passphrase)
+    write_atomically(home.config, text.encode())
+    elsewhere = {} if ca is None else {"ca": str(ca.absolute())}
+    make_home(home.path, HomeKind.OPERATOR, **elsewhere, reader=str(reader.path.absolute()))
+    return keys
+
+
+def _make_ca(folder: Path, passphrase: bytes, now: datetime) -> CertificateAuthority:
+    if not (folder / "ca.key.pem").exists():
+        made = ids.create_ca("rosbridge-eth CA", at=now)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        write_atomically(folder / "ca.crt.pem", made.certificate.to_pem(), new=True)
+        write_atomically(folder / "ca.key.pem", made.key.to_pem(passphrase), mode=0o600, new=True)
+    return ids.load_ca(folder, passphrase, now)
+
+
+def server_trust(home: OperatorHome, registry: Registry) -> ids.Trust:
+    """Whom the server believes: certificates of the CA that are in force in the registry."""
+    try:
+        roots = ids.read_certificates(home.ca_certificate.read_bytes())
+    except OSError as error:
+        raise IdentityError(f"{home.ca_certificate} cannot be read: {error.strerror}") from error
+    return ids.Trust(roots, allowed=registry.allows)
+
+
+def load_server_identity(home: OperatorHome, passphrase: bytes) -> ids.Identity:
+    identity, _ = ids.load_identity(home.server, passphrase)
+    return identity
+
+
+def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime) -> Path:
+    """Give the server new keys and certificates under its name; where the old ones are kept.
+
+    Robots know the server by its name and the CA, so nothing changes for them. A running server goes on with the old
+    ones until it is started again.
+    """
+    made = home.path / ".server.new"
+    shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
+    names = (f"server.until-{now:%Y%m%dT%H%M%SZ}{suffix}" for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
+    old = next(home.path / name for name in names if not (home.path / name).exists())
+    with Registry(home.registry) as registry:
+        identity = ids.enrol(ca, Role.SERVER, load_server_config(home.config).name, at=now)
+        ids.save_identity(made, identity, [ca.certificate], passphrase)
+        if home.server.exists():
+            home.server.rename(old)
+        made.rename(home.server)
+        registry.enrol(identity.public, now, replace=True)
+    return old
+
+
+def backup(path: Path, target: Path) -> None:
+    """Copy a home, in use or not, into a new folder. Left out are a CA kept elsewhere, and a robot's spool: a log that
+    goes on from an old copy would look forked."""
+    home_of(path)
+    require_empty(target)
+    target.mkdir(mode=0o700, parents=True, exist_ok=True)
+    skipped = shutil.ignore_patterns("*.sqlite*", "*.lock", ".*", "home.json")
+    shutil.copytree(path, target, ignore=skipped, dirs_exist_ok=True)
+    for database in path.glob("*.sqlite"):
+        if database != RobotHome(path).spool:
+            with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(target / database.name)) as copy:
+                ours.backup(copy)
+            (target / database.name).chmod(0o600)
+    shutil.copy2(path / "home.json", target)
+
+
+def change_passphrase(path: Path, old: bytes, new: bytes) -> list[Path]:
+    """Put the keys of a home under another passphrase; which files. Cut short, it is run again with the same two.
+
+    A CA in a folder elsewhere keeps its own.
+    """
+    folder = {HomeKind.OPERATOR: "server", HomeKind.ROBOT: "identity", HomeKind.READER: "."}[kind_of(path)]
+    files, changed = [file for name in (folder, "ca") for file in (path / name).glob("*.key.pem")], dict[Path, bytes]()
+    if (accounts := OperatorHome(path).accounts).exists():
+        files.append(accounts)
+    for file in files:
+        require_private(file)
+        for passphrase in (old, new):  # what an attempt that was cut short wrote is under the new one
+            with suppress(InvalidKey, IdentityError):
+                if file == accounts:
+                    changed[file] = Keyring.load(file, passphrase).seal(new)
+                else:
+                    changed[file] = sm2.PrivateKey.from_pem(file.read_bytes(), passphrase).to_pem(new)
+                break
+        else:
+            raise IdentityError(f"{file} does not open under this passphrase")
+    for file, content in changed.items():
+        write_atomically(file, content, mode=0o600)
+    return list(changed)
+
+
+# The contract
+
+
+def deploy_contract(
+    home: OperatorHome, where: Any, keys: Keyring, *, wait: float = 0.0, clock: Callable[[], float] = time.time,
+    pause: Callable[[float], None] = time.sleep,
+) -> Deployment:
+    """Create the contract and write down where it is; ConfigError where one is written down already.
+
+    where: a node's URL or a provider. wait: seconds for a node to answer and for ETH on the operator's account.
+    """
+    if home.deployment_file.exists():
+        raise ConfigError(
+            f"a contract is deployed already ({home.deployment().contract}); a second one would split the logs."
+            f" Make another home, or move {home.deployment_file} away if that chain is gone"
+        )
+    last = clock() + wait
+    while True:
+        try:
+            ledger = Ledger.deploy(where, keys.operator)
+            break
+        except (ChainUnavailable, OutOfFunds) as error:
+            if clock() >= last:
+                if isinstance(error, OutOfFunds):
+                    raise OutOfFunds(
+                        f"{error}: put at least 1 ETH on the operator's account {keys.operator.address} and deploy"
+                        " again; it pays for the contract and for the robots"
+                    ) from error
+                raise
+            pause(0.5)
+    made = Deployment(ledger.chain_id, "0x" + ledger.genesis.hex(), ledger.contract, ledger.block_number())
+    home.save_deployment(made)
+    url = urlsplit(load_server_config(home.config).chain.url)
+    # Of the operator's node only scheme, host and port: what else stands in a URL is often a key.
+    node = f"{url.scheme}://{url.netloc.rpartition('@')[2]}"
+    write_atomically(home.reader_config, _reader_toml(made, node).encode())
+    owner = Path(home_of(home.path)["reader"])
+    if (owner / "home.json").exists():  # it may have been carried away
+        shutil.copy(home.reader_config, ReaderHome(owner).config)
+    return made
+
+
+def _reader_toml(ledger: Deployment, node: str) -> str:
+    return (
+        "# A reader: put this beside its keys. docs/configuration.md describes every key.\n"
+        f'contract = "{ledger.contract}"\n'
+        f"chain_id = {ledger.chain_id}\n"
+        f'genesis = "{ledger.genesis}"\n'
+        f"from_block = {ledger.block}\n"
+        'ca = "ca.crt.pem"\n'
+        'identity = "."\n'
+        f'chain = ["{node}"]  # any nodes of this chain\n'
+    )
+
+
+# Readers
+
+
+def add_reader(
+    home: OperatorHome, name: str, reader: ReaderHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime,
+    replace: bool = False,
+) -> None:
+    """Make another reader in a folder of its own; robots that are registered from now on seal for it, too.
+
+    replace: take a used name over. What was sealed for the old one only its own keys open.
+    """
+    check_name(name)
+    require_empty(reader.path)
+    with Registry(home.registry) as registry:
+        if not replace:
+            registry.require_free(Role.READER, name)
+        if len({name, *(known.name for known in registry.readers())}) > MAX_READERS:
+            raise IdentityError(f"a chunk can be sealed for {MAX_READERS} readers; more people share a reader's key")
+        _make_reader(home, reader, name, ca, passphrase, now, registry, replace=replace)
+
+
+def _make_reader(
+    home: OperatorHome, reader: ReaderHome, name: str, ca: CertificateAuthority, passphrase: bytes, now: datetime,
+    registry: Registry, *, replace: bool = False,
+) -> None:  # fmt: skip
+    identity = ids.enrol(ca, Role.READER, name, at=now)
+    ids.save_identity(reader.path, identity, [ca.certificate], passphrase)
+    write_atomically(reader.public, identity.public.pem)
+    if home.reader_config.exists():
+        shutil.copy(home.reader_config, reader.config)
+    registry.enrol(identity.public, now, replace=replace)
+    write_atomically(home.readers / f"{name}.pem", identity.public.pem)
+    make_home(reader.path, HomeKind.READER, name=name)
+
+
+# Robots
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A robot that was registered: its account, the block, the bundle's file.
+
+    own_keys: nobody but the robot can sign as it. funded: False where the operator's account has no ETH for it; the
+    server gives it some later. buried: chunks of the one that bore the name before which became dead letters.
+    """
+
+    name: str
+    account: str
+    block: int
+    bundle: Path
+    own_keys: bool
+    funded: bool
+    buried: int
+
+
+def register_robot(
+    home: OperatorHome, name: str, *, ca: CertificateAuthority, keys: Keyring, ledger: Ledger,
+    inbox: Callable[[], Inbox], now: datetime, request: Request | None = None, password: bytes | None = None,
+    replace: bool = False, compromised: bool = False, patience: float = SUCCESSION,
+    clock: Callable[[], float] = time.time, pause: Callable[[float], None] = time.sleep,
+) -> Registered:  # fmt: skip
+    """Bind a name to certificates and an account, on the chain and in the registry, and write the bundle.
+
+    request: of the robot that made its own keys. Without it they are made here, and the bundle is sealed under
+    `password` (the paper's easy_register); whoever made them can sign as the robot.
+
+    replace: take a used name over. The old robot ends first, and for `patience` seconds what it handed over is waited
+    for, since afterwards it would count as written after its end; StoreError if it is not confirmed by then.
+    compromised: it becomes dead letters instead. inbox: opened where there is something to replace; clock, pause: the
+    wall clock. The chain comes before the registry: a crash in between leaves a registration that `replace` replaces.
+    """
+    config, deployment, tk = load_server_config(home.config), home.deployment(), robot_id(check_name(name))
+    if name == OPERATOR:
+        raise IdentityError(f"{name!r} is what the treasury's account is called; choose another name for the robot")
+    if request is not None and request.name != name:
+        raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
+    end = BridgeEnd(
+        name, config.name, str(config.address_for_robots()), deployment.chain_id, deployment.genesis,
+        deployment.contract,
+    )
+    with Registry(home.registry) as registry:
+        [standing] = ledger.standings([tk])
+        if not replace:
+            registry.require_free(Role.ROBOT, name)
+            if standing.account is not None:
+                raise IdentityError(_taken(name, standing))
+        buried = 0
+        if standing.account is not None:
+            registry.revoke(Role.ROBOT, name, now)
+            if not compromised and not standing.revoked:
+                if left := _waiting(inbox, tk, patience, clock, pause):
+                    raise StoreError(
+                        f"{left} chunks that the old {name!r} handed to the server are not confirmed on the chain yet,"
+                        " and would count as written after its end: let the server run and register again, or give"
+                        " them up with --compromised"
+                    )
+            else:
+                pause(0.0 if standing.revoked else HANDING_OVER)
+                buried = _bury(inbox, tk, standing, f"{name} was replaced")
+        if request is None:
+            identity = ids.enrol(ca, Role.ROBOT, name, at=now)
+            peer, files = identity.public, ids.identity_files(identity, [ca.certificate], password)
+        else:
+            peer = ids.enrol_requests(ca, Role.ROBOT, name, request.signing, request.encryption, at=now)
+            files = {
+                "sign.crt.pem": peer.signing_certificate.to_pem(),
+                "enc.crt.pem": peer.encryption_certificate.to_pem(),
+                "ca.crt.pem": ca.certificate.to_pem(),
+            }
+        number, account, block = _register(registry, ledger, keys, tk, peer.certificates, standing)
+        registry.enrol(peer, now, number=number, account=account, replace=replace)
+        readers = {reader.name: reader.certificates.decode() for reader in registry.readers()}
+    parts: tuple[dict[str, str], dict[str, str]] = ({}, {})
+    for file, content in files.items():
+        parts[file in ids.KEY_FILES][file] = content.decode()
+    made = Bundle(end, parts[False], readers, parts[True])
+    path = home.bundles / f"{name}.bundle"
+    write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
+    funded = True
+    try:
+        if ledger.balance(account) < int(config.funds.below * ETH):  # else its first chunk waits for the submitter
+            ledger.alloc_eth(keys.operator, account, int(config.funds.by * ETH))
+    except OutOfFunds:
+        funded = False
+    return Registered(name, account, block, path, request is not None, funded, buried)
+
+
+def _register(
+    registry: Registry, ledger: Ledger, keys: Keyring, tk: bytes, certificates: bytes, standing: Standing
+) -> tuple[int, str, int]:
+    """Register on the chain with the next account that serves no other robot: number, account and block."""
+    put = ledger.registration if standing.account is None else ledger.replace_registration
+    first = registry.next_number()
+    for number in range(first, first + ACCOUNTS_TRIED):
+        account = keys.robot(number).address
+        try:
+            return number, account, put(keys.operator, tk, account, certificates).block
+        except Reverted as refused:
+            if refused.name != "AccountInUse":  # by a robot that a registry from an older backup does not know
+                raise
+    raise StoreError(
+        f"the contract knows the accounts {first} to {first + ACCOUNTS_TRIED - 1} of this home and the registry does"
+        " not: restore registry.sqlite from a newer backup"
+    )
+
+
+def _taken(name: str, standing: Standing) -> str:
+    """Why a name that the registry has not in force cannot be had without `replace`."""
+    if standing.revoked:
+        return f"robot {name!r} was revoked; give --replace to enrol the name anew, with a new account and new keys"
+    return f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
+
+
+def _waiting(
+    inbox: Callable[[], Inbox], tk: bytes, patience: float, clock: Callable[[], float], pause: Callable[[float], None]
+) -> int:
+    """Wait until all that a robot out of force handed to the server is confirmed; how many chunks are not by then."""
+    closed = clock() + HANDING_OVER
+    with closing(inbox()) as store:
+        while True:
+            now = clock()
+            waiting = store.totals().get(tk)
+            left = 0 if waiting is None else waiting.chunks
+            if now >= closed and (left == 0 or now >= closed + patience):
+                return left
+            pause(0.2)
+
+
+def _bury(inbox: Callable[[], Inbox], tk: bytes, standing: Standing, why: str) -> int:
+    """What the chain does not have of this robot becomes dead letters; how many chunks."""
+    with closing(inbox()) as store:
+        return store.bury(tk, store.find(tk, standing.tail), why)
+
+
+@dataclass(frozen=True, slots=True)
+class Revoked:
+    """block: where the contract ended a robot's right to write; None for others, and where it had none.
+
+    buried: chunks that the server has, that are not on the chain, and that became dead letters.
+    """
+
+    block: int | None
+    buried: int = 0
+
+
+def revoke(
+    home: OperatorHome, role: Role, name: str, *, keys: Keyring, ledger: Ledger, inbox: Callable[[], Inbox],
+    now: datetime, compromised: bool = False, patience: float = LAST_WRITES, clock: Callable[[], float] = time.time,
+    pause: Callable[[float], None] = time.sleep,
+) -> Revoked:  # fmt: skip
+    """Take a name out of force: the server closes its session at once, the contract ends its right to write.
+
+    The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
+    of it is given `patience` seconds to be written, none with `compromised`; the rest becomes dead letters.
+    ChainError: half done; it is run again when the node answers.
+    """
+    with Registry(home.registry) as registry:
+        known = any(enrolment.name == name for enrolment in registry.all(role))
+        in_force = registry.revoke(role, name, now)
+    if role is not Role.ROBOT:
+        if not in_force:
+            raise IdentityError(_not_in_force(role, name, known))
+        (home.readers / f"{name}.pem").unlink(missing_ok=True)
+        return Revoked(None)
+    tk = robot_id(name)
+    try:
+        [standing] = ledger.standings([tk])
+        if standing.account is None or standing.revoked:
+            if not in_force:
+                raise IdentityError(_not_in_force(role, name, known))
+            return Revoked(None)
+        if compromised:
+            pause(HANDING_OVER)
+        else:
+            _waiting(inbox, tk, patience, clock, pause)
+        buried = _bury(inbox, tk, ledger.standings([tk])[0], f"{name} was revoked")
+        return Revoked(ledger.revoke_robot(keys.operator, tk).block, buried)
+    except ChainError as error:
+        raise ChainError(
+            f"half done: the server takes nothing from {name} any more, but the contract does not know it yet"
+            f" ({error}); run `revoke {name}` again when the node answers"
+        ) from error
+
+
+def _not_in_force(role: Role, name: str, known: bool) -> str:
+    return f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
