@@ -29,7 +29,6 @@ from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import require_private, write_atomically
 from rosbridge_eth.home import (
-    ETH,
     BridgeEnd,
     Deployment,
     HomeKind,
@@ -44,6 +43,7 @@ from rosbridge_eth.home import (
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
+from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.registry import OWNER, Registry
 from smcrypto import InvalidKey, sm2
@@ -239,7 +239,7 @@ def deploy_contract(
     last = clock() + wait
     while True:
         try:
-            ledger = Ledger.deploy(where, keys.operator)
+            ledger, receipt = Ledger.deploy(where, keys.operator)
             break
         except (ChainUnavailable, OutOfFunds) as error:
             if clock() >= last:
@@ -250,7 +250,7 @@ def deploy_contract(
                     ) from error
                 raise
             pause(0.5)
-    made = Deployment(ledger.chain_id, "0x" + ledger.genesis.hex(), ledger.contract, ledger.block_number())
+    made = Deployment(ledger.chain_id, "0x" + ledger.genesis.hex(), ledger.contract, receipt.block)
     home.save_deployment(made)
     url = urlsplit(load_server_config(home.config).chain.url)
     # Of the operator's node only scheme, host and port: what else stands in a URL is often a key.
@@ -395,8 +395,8 @@ def register_robot(
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
     funded = True
     try:
-        if ledger.balance(account) < int(config.funds.below * ETH):  # else its first chunk waits for the submitter
-            ledger.alloc_eth(keys.operator, account, int(config.funds.by * ETH))
+        if ledger.balance(account) < int(config.funds.below * WEI_PER_ETH):  # so that its first chunk need not wait
+            ledger.alloc_eth(keys.operator, account, int(config.funds.by * WEI_PER_ETH))
     except OutOfFunds:
         funded = False
     return Registered(name, account, block, path, request is not None, funded, buried)

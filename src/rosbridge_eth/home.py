@@ -44,9 +44,6 @@ from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError
 from rosbridge_eth.files import write_atomically as write_atomically
 
-ETH = 10**18
-"""One ether, in wei."""
-
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
 _FORMAT = "rosbridge-eth home 2"
 _OF_THE_FIRST_EDITION = ("server.toml", "bridge.json", "reader.toml", "journal.sqlite")
@@ -70,7 +67,7 @@ def ledger_of(chain_id: int, genesis: str, contract: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Deployment:
-    """A contract on a chain, in `block` or before it. The first block's hash and the address are 0x-hex."""
+    """A contract on a chain; `block` holds its creation. The first block's hash and the address are 0x-hex."""
 
     chain_id: int
     genesis: str
@@ -184,7 +181,7 @@ class OperatorHome:
     @property
     def ca(self) -> Path:
         """The folder of the CA's key and certificate; `init` may have been given another than ours."""
-        return self.path / home_of(self.path).get("ca", "ca")
+        return self.path / str(home_of(self.path).get("ca", "ca"))
 
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""
