@@ -1,0 +1,377 @@
+"""Chunks: what is sealed comes back, what was changed is found, and a robot that lies harms nobody."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.log.making import (
+    LINES,
+    LOG,
+    READER,
+    ROBOT,
+    SECOND,
+    STRANGER,
+    STREAM,
+    header_bytes,
+    lying,
+    repeating,
+    root_of,
+    sealed,
+    signed,
+)
+from rosbridge_eth import chunk as chunks
+from rosbridge_eth.chunk import (
+    MAX_BODY,
+    MAX_CHUNK,
+    MAX_LINE,
+    MAX_PLAINTEXT,
+    MAX_RECORDS,
+    Altered,
+    Chunk,
+    ChunkError,
+    Forged,
+    Header,
+    Log,
+    Malformed,
+    NoGrant,
+    TooLarge,
+    Unopenable,
+    content_key,
+    drop,
+    ledger_id,
+    open_lines,
+    robot_id,
+    verify,
+    zstd,
+)
+from rosbridge_eth.errors import BridgeError, ExitCode
+from smcrypto import sm2, sm3
+
+lines_strategy = st.lists(
+    st.binary(min_size=1, max_size=200).map(lambda b: b.replace(b"\n", b" ")), min_size=0, max_size=20
+)
+CHUNK = sealed()
+EMPTY = sealed([], goodbye=True)
+
+
+def opened(chunk: Chunk, reader: sm2.PrivateKey = READER, log: Log = LOG) -> tuple[bytes, ...]:
+    return open_lines(log, chunk, content_key(chunk.header, reader))
+
+
+# What is sealed comes back
+
+
+@given(lines_strategy, st.booleans(), st.booleans(), st.integers(0, 2**64 - 1), st.integers(1, 4))
+@settings(max_examples=40)
+def test_what_is_sealed_is_read_by_every_reader_and_by_nobody_else(lines, compress, goodbye, number, count):
+    readers = [sm2.PrivateKey.from_int(50 + i) for i in range(count)]
+    made = sealed(
+        lines, number=number, compress=compress, goodbye=goodbye, readers=[reader.public_key for reader in readers]
+    )
+    chunk = Chunk.parse(memoryview(made.encoded))
+    assert chunk == made and chunk.encoded == made.encoded
+    assert (chunk.header.number, chunk.header.records, chunk.header.goodbye) == (number, len(lines), goodbye)
+    assert chunk.header.digest == sm3.digest(chunk.header.encoded)
+    assert not chunk.dropped
+    verify(LOG, ROBOT.public_key, chunk)
+    if not lines:
+        assert chunk.body == b"" and chunk.header.grants == () and open_lines(LOG, chunk, bytes(16)) == ()
+        return
+    for reader in readers:
+        assert opened(chunk, reader) == tuple(lines)
+    with pytest.raises(NoGrant):
+        content_key(chunk.header, STRANGER)
+
+
+@pytest.mark.parametrize("level", [1, 3, 15])
+def test_every_level_makes_frames_that_open(level):
+    assert opened(sealed(level=level)) == LINES
+
+
+def test_nothing_of_the_lines_is_in_the_open_part_and_sizes_are_multiples_of_64():
+    lines = [b'{"topic":"/secret"}' * 10]
+    chunk = sealed(lines, compress=False)
+    assert b"secret" not in chunk.encoded
+    assert (len(chunk.body) - 16) % 64 == 0
+    longer = sealed([lines[0] + b" "], compress=False)
+    assert len(longer.encoded) == len(chunk.encoded)
+
+
+def test_without_compression_the_size_tells_nothing_but_the_length():
+    same, different = [b"a" * 5000], [bytes(range(33, 83)) * 100]
+    assert len(sealed(same, compress=False).body) == len(sealed(different, compress=False).body)
+    assert len(sealed(same).body) < len(sealed(different).body) < 5000
+
+
+def test_the_longest_line_fits_whatever_it_holds_and_the_longest_chunk_is_no_longer_than_it_says():
+    noise = repeating()(MAX_LINE).replace(b"\n", b" ")
+    for compress in (True, False):
+        assert opened(sealed([noise], compress=compress)) == (noise,)
+    noise += repeating(2)(4000).replace(b"\n", b" ")
+    full = sealed([noise], compress=False, readers=[sm2.PrivateKey.from_int(9 + i).public_key for i in range(16)])
+    assert MAX_CHUNK - 64 < len(full.encoded) <= MAX_CHUNK
+    assert len(full.body) <= MAX_BODY
+    assert Chunk.parse(full.encoded) == full
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_lines_that_do_not_fit_are_too_large(compress):
+    noise = repeating()(2 * MAX_BODY).replace(b"\n", b" ")
+    for lines in ([noise], [noise[:40_000], noise[40_000:80_000]], [b"x"] * (MAX_RECORDS + 1), [b"x" * MAX_PLAINTEXT]):
+        with pytest.raises(TooLarge):
+            sealed(lines, compress=compress)
+    assert len(opened(sealed([b"x"] * MAX_RECORDS, compress=compress))) == MAX_RECORDS
+
+
+def test_a_robot_cannot_seal_what_readers_would_not_take():
+    for lines in ([b""], [b"a", b""], [b"a\nb"]):
+        with pytest.raises(ValueError, match="line"):
+            sealed(lines)
+    for count in (0, 17):
+        with pytest.raises(ValueError, match="readers"):
+            sealed(readers=[READER.public_key] * count)
+
+
+def test_errors_are_of_the_bridge_and_end_a_command_as_a_verification():
+    for kind in (Malformed, Altered, Forged, Unopenable, NoGrant, TooLarge):
+        assert issubclass(kind, ChunkError) and issubclass(kind, BridgeError)
+        assert kind.exit_code is ExitCode.VERIFICATION
+
+
+def test_ids():
+    # keccak256 of the empty text is known from Ethereum: the code hash of an account without code.
+    assert robot_id("").hex() == "c5d2460186f7233c927e7db2dcc703c0e500b653ca82273b7bfad8045d85a470"
+    assert ledger_id(5, b"g" * 32, b"c" * 20) == sm3.digest(bytes(31) + b"\5" + b"g" * 32 + b"c" * 20)
+    for genesis, contract in ((b"g" * 31, b"c" * 20), (b"g" * 32, b"c" * 21)):
+        with pytest.raises(ValueError, match="bytes"):
+            ledger_id(5, genesis, contract)
+
+
+# What was changed is found
+
+
+@pytest.mark.parametrize("chunk", [CHUNK, drop(LOG, ROBOT, CHUNK), EMPTY], ids=["whole", "dropped", "empty"])
+def test_a_flipped_bit_anywhere_is_found_without_a_key(chunk):
+    source = repeating()
+    for place in range(len(chunk.encoded)):
+        data = bytearray(chunk.encoded)
+        data[place] ^= 1 << source(1)[0] % 8
+        with pytest.raises((Malformed, Altered, Forged)):
+            verify(LOG, ROBOT.public_key, Chunk.parse(bytes(data)))
+
+
+@given(st.integers(0, len(CHUNK.body) * 8 - 1))
+def test_a_flipped_bit_of_a_body_does_not_open(bit):
+    body = bytearray(CHUNK.body)
+    body[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(Unopenable):
+        opened(Chunk(CHUNK.header, CHUNK.signature, bytes(body)))
+
+
+@pytest.mark.parametrize("chunk", [CHUNK, drop(LOG, ROBOT, CHUNK), EMPTY], ids=["whole", "dropped", "empty"])
+def test_a_chunk_that_is_cut_or_longer_is_found(chunk):
+    for size in range(len(chunk.encoded)):
+        with pytest.raises((Malformed, Forged)):
+            verify(LOG, ROBOT.public_key, Chunk.parse(chunk.encoded[:size]))
+    for more in (b"\0", b"x" * 64, bytes(MAX_CHUNK)):
+        with pytest.raises(Malformed):
+            Chunk.parse(chunk.encoded + more)
+
+
+@given(st.binary(max_size=400))
+def test_any_bytes_are_a_chunk_or_malformed(data):
+    for parse in (Header.parse, Chunk.parse):
+        with contextlib.suppress(Malformed):
+            assert parse(data).encoded == data
+
+
+def test_only_the_robot_takes_a_body_away():
+    stripped = Chunk.parse(CHUNK.encoded[: -len(CHUNK.body)])
+    assert stripped.dropped
+    with pytest.raises(Forged):
+        verify(LOG, ROBOT.public_key, stripped)
+    dropped = Chunk.parse(drop(LOG, ROBOT, CHUNK).encoded)
+    verify(LOG, ROBOT.public_key, dropped)
+    assert dropped.dropped and dropped.header == CHUNK.header
+    with pytest.raises(Forged):  # the signature of the dropped form is none for the whole one
+        verify(LOG, ROBOT.public_key, Chunk(CHUNK.header, dropped.signature, CHUNK.body))
+    with pytest.raises(ValueError, match="no body"):
+        opened(dropped)
+    assert drop(LOG, ROBOT, dropped) == dropped and drop(LOG, ROBOT, EMPTY) == EMPTY and not EMPTY.dropped
+
+
+def test_a_chunk_means_nothing_for_another_chain_contract_robot_or_key():
+    for log in (Log(ledger_id(1, b"g" * 32, b"c" * 20), LOG.tk), Log(LOG.ledger, robot_id("robot_2"))):
+        with pytest.raises(Forged):
+            verify(log, ROBOT.public_key, CHUNK)
+        with pytest.raises(Unopenable):
+            opened(CHUNK, log=log)
+    with pytest.raises(Forged):
+        verify(LOG, STRANGER.public_key, CHUNK)
+
+
+def test_a_body_of_another_chunk_is_altered():
+    other = sealed(number=4)
+    with pytest.raises(Altered):
+        verify(LOG, ROBOT.public_key, Chunk(CHUNK.header, CHUNK.signature, other.body))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"version": 1}, {"version": 3}, {"flags": 2}, {"flags": 0x81}, {"n": 0}, {"n": 2}, {"n": 17},
+        {"records": 0}, {"records": MAX_RECORDS + 1}, {"records": 2**32 - 1}, {"sealed_ms": chunks.MAX_TIME_MS},
+        {"body_length": 0}, {"body_length": 16}, {"body_length": 64}, {"body_length": 81},
+        {"body_length": MAX_BODY + 16}, {"body_length": 2**32 - 1},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_header_that_cannot_be_is_malformed(changes):
+    data = header_bytes(CHUNK.header, **changes)
+    with pytest.raises(Malformed):
+        Header.parse(data)
+    with pytest.raises(Malformed):
+        Chunk.parse(data + CHUNK.signature + CHUNK.body)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"records": 1}, {"body_length": 80}, {"root": bytes(32)}, {"body_digest": bytes(32)}], ids=str
+)
+def test_a_chunk_without_records_has_nothing_else(changes):
+    with pytest.raises(Malformed):
+        Header.parse(header_bytes(EMPTY.header, **changes))
+    grant = CHUNK.header.encoded[-121:]
+    with pytest.raises(Malformed):
+        Header.parse(header_bytes(EMPTY.header, n=1) + grant)
+
+
+def test_sixteen_grants_are_a_header_and_seventeen_are_not():
+    grant = CHUNK.header.encoded[-121:]
+    assert len(Header.parse(header_bytes(CHUNK.header, n=16) + 15 * grant).grants) == 16
+    with pytest.raises(Malformed):
+        Header.parse(header_bytes(CHUNK.header, n=17) + 16 * grant)
+
+
+# A robot that lies: the signature holds, the content does not
+
+FRAME = zstd.compress(b"a\n")
+SKIPPABLE = struct.pack("<II", 0x184D2A50, 4) + b"skip"
+
+
+def streamed(content: bytes, window_log: int) -> bytes:
+    """A frame that does not say its content's size, with this window."""
+    packing = zstd.ZstdCompressor(options={int(zstd.CompressionParameter.window_log): window_log})
+    return packing.compress(content) + packing.flush()
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        {"frame": b""}, {"frame": b"a\n"}, {"frame": FRAME[:-1] + b"\xff"}, {"frame": FRAME[:-3]},
+        {"frame": FRAME + FRAME}, {"frame": FRAME + b"\0\0\1"}, {"frame": FRAME + SKIPPABLE},
+        {"frame": SKIPPABLE + FRAME}, {"frame": SKIPPABLE}, {"frame": FRAME, "pad": 64 - len(FRAME) + 64},
+        {"frame": streamed(b"a\n" * 10, 23)},
+        {"frame": zstd.compress(b"\n")}, {"frame": zstd.compress(b"")}, {"frame": zstd.compress(b"a")},
+        {"frame": zstd.compress(b"\na\n")}, {"frame": zstd.compress(b"a\n\n")},
+        {"frame": zstd.compress(b"a\n\nb\n"), "records": 2},
+        {"frame": zstd.compress(b"a\n" * (MAX_RECORDS + 1)), "records": MAX_RECORDS},
+        {"frame": zstd.compress(b"a\nb\n"), "records": 1}, {"frame": FRAME, "records": 2},
+        {"frame": FRAME, "root": root_of([b"b"])}, {"frame": FRAME, "root": root_of([b"a"], b"j" * 16)},
+        {"frame": FRAME, "sealed_under": b"j" * 16},
+    ],
+    ids=lambda what: str(what)[:60],
+)  # fmt: skip
+def test_what_the_robot_signed_and_cannot_be_opened_is_unopenable(what):
+    chunk = lying(**{"root": root_of([b"a"])} | what) if what["frame"] else lying(b"", pad=64)
+    verify(LOG, ROBOT.public_key, chunk)
+    with pytest.raises(Unopenable):
+        opened(chunk)
+
+
+def test_a_frame_made_otherwise_is_taken_as_long_as_it_is_one():
+    for frame in (streamed(b"a\n", 22), streamed(b"a\n", 10), zstd.compress(b"a\n", 19), chunks._stored(b"a\n")):
+        assert opened(lying(frame, root=root_of([b"a"]))) == (b"a",)
+
+
+def test_a_zip_bomb_is_unopenable_and_costs_no_memory():
+    bomb = streamed(b"a\n" * 2**26, 22)
+    assert len(bomb) < MAX_BODY
+    claims = b"\x28\xb5\x2f\xfd\xe0" + (2**62).to_bytes(8, "little") + b"\x11\0\0a\n"  # 2^62 bytes, and has two
+    for frame in (bomb, zstd.compress(b"a" * (MAX_PLAINTEXT + 1)), zstd.compress(b"a\n" * 2**21), claims):
+        with pytest.raises(Unopenable):
+            opened(lying(frame, records=MAX_RECORDS))
+    fits = zstd.compress(b"a" * (MAX_PLAINTEXT - 1) + b"\n")
+    assert len(opened(lying(fits, root=root_of([b"a" * (MAX_PLAINTEXT - 1)])))[0]) == MAX_PLAINTEXT - 1
+
+
+def test_a_grant_that_holds_no_key_is_unopenable_and_a_second_one_is_tried():
+    junk = CHUNK.header.encoded[-121:-113] + b"\4" + bytes(112)
+    good = CHUNK.header.encoded[-121:]
+    fixed = header_bytes(CHUNK.header)[:139]
+    with pytest.raises(Unopenable):
+        content_key(Header.parse(fixed + junk), READER)
+    two = Header.parse(fixed[:-1] + b"\2" + junk + good)
+    assert content_key(two, READER) == content_key(CHUNK.header, READER)
+    elsewhere = sealed(number=9, readers=[SECOND.public_key])
+    with pytest.raises(NoGrant):
+        content_key(elsewhere.header, READER)
+
+
+def test_a_reader_looks_the_same_to_nobody_in_two_chunks():
+    tags = {sealed(number=n, stream=stream).header.grants[0][0] for n in (0, 1) for stream in (STREAM, b"s" * 16)}
+    assert len(tags) == 4
+
+
+def test_a_key_handed_over_opens_this_chunk_and_no_other():
+    first, second = sealed(number=1), sealed(number=2)
+    key = content_key(first.header, READER)
+    assert open_lines(LOG, first, key) == LINES
+    with pytest.raises(Unopenable):
+        open_lines(LOG, second, key)
+
+
+def test_the_signature_binds_what_it_was_made_for():
+    other = signed(CHUNK.header.encoded, CHUNK.body, purpose="finished")
+    with pytest.raises(Forged):
+        verify(LOG, ROBOT.public_key, other)
+
+
+# Keys
+
+
+def test_two_forks_with_the_same_random_bytes_never_encrypt_two_contents_under_one_key():
+    keys = {
+        content_key(sealed(lines, number=number, randomness=lambda size: bytes(size), **more).header, READER)
+        for lines in ([b"one"], [b"two"], [b"one", b"two"])
+        for number in (0, 1)
+        for more in ({}, {"stream": b"s" * 16}, {"compress": False})
+    }
+    assert len(keys) == 18
+
+
+def test_another_robot_log_or_randomness_is_another_key():
+    def key(log: Log, robot: sm2.PrivateKey, random: bytes) -> bytes:
+        chunk = chunks.seal(
+            log, robot, LINES, stream=STREAM, number=0, previous=bytes(32), sealed_ms=0,
+            readers=[READER.public_key], randomness=lambda size: random,
+        )  # fmt: skip
+        return content_key(chunk.header, READER)
+
+    usual = key(LOG, ROBOT, bytes(32))
+    assert usual == key(LOG, ROBOT, bytes(32))
+    others = {
+        key(Log(b"x" * 32, LOG.tk), ROBOT, bytes(32)), key(Log(LOG.ledger, b"x" * 32), ROBOT, bytes(32)),
+        key(LOG, STRANGER, bytes(32)), key(LOG, ROBOT, b"\1" * 32), usual,
+    }  # fmt: skip
+    assert len(others) == 5
+
+
+def test_reprs_show_neither_content_nor_keys():
+    text = repr(CHUNK)
+    assert CHUNK.body.hex() not in text and "body=" not in text and "encoded=" not in text and "grants=" not in text
+    assert str(CHUNK.header) == "chunk 3 of stream 00010203"

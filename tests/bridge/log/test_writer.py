@@ -1,0 +1,332 @@
+"""The robot's pen: when chunks are closed, what stands in them and in which order, and how they link."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bridge.log.making import LOG, READER, ROBOT, repeating
+from rosbridge_eth.chunk import (
+    MAX_BODY,
+    MAX_LINE,
+    MAX_RECORDS,
+    MAX_TIME_MS,
+    Chunk,
+    TooLarge,
+    content_key,
+    open_lines,
+    verify,
+)
+from rosbridge_eth.writer import MAX_JSON, LogWriter
+
+STREAM_LINE = b'{"stream":{"source":"sim"}}'
+ZEROS = bytes(32)
+
+
+def writer(**changes: Any) -> LogWriter:
+    given: dict[str, Any] = {"previous": ZEROS, "stream_line": STREAM_LINE, "now": 0.0}
+    return LogWriter(LOG, ROBOT, [READER.public_key], **given | changes)
+
+
+def started(**changes: Any) -> LogWriter:
+    """A writer whose first chunk, with nothing but the stream's line, is gone at second 1."""
+    made = writer(**changes)
+    assert [read(chunk) for chunk in made.closed(1.0, 1)] == [(STREAM_LINE,)]
+    return made
+
+
+def read(chunk: Chunk) -> tuple[bytes, ...]:
+    verify(LOG, ROBOT.public_key, chunk)
+    return open_lines(LOG, chunk, content_key(chunk.header, READER)) if chunk.body else ()
+
+
+def message(i: int, size: int = 20) -> bytes:
+    return (b'{"n":%d}' % i).ljust(size)
+
+
+def noise(seed: int, size: int) -> bytes:
+    """A line that no compressor makes shorter."""
+    return random.Random(seed).randbytes(size).replace(b"\n", b" ")
+
+
+def check_links(chunks: list[Chunk], previous: bytes = ZEROS) -> None:
+    number, stream = 0, None
+    for chunk in chunks:
+        number = number + 1 if chunk.header.stream == stream else 0
+        stream = chunk.header.stream
+        assert (chunk.header.number, chunk.header.previous) == (number, previous)
+        previous = chunk.header.digest
+
+
+# When
+
+
+def test_a_chunk_is_closed_a_period_after_its_first_line():
+    made = started(period=2.0, now=-1.0)
+    made.add(message(0), 5.0)
+    made.add(message(1), 6.9)
+    assert made.next_timer() == 7.0 and made.closed(6.99, 0) == []
+    assert [read(chunk) for chunk in made.closed(7.0, 0)] == [(message(0), message(1))]
+    made.add(message(2), 7.5)
+    assert made.next_timer() == 9.5
+
+
+def test_a_start_shows_after_a_period_though_nothing_is_captured():
+    made = writer(period=0.5, now=10.0)
+    assert made.next_timer() == 10.5 and made.closed(10.4, 0) == []
+    assert [read(chunk) for chunk in made.closed(10.5, 0)] == [(STREAM_LINE,)]
+
+
+def test_a_chunk_is_closed_at_a_thousand_records_and_the_rest_waits_for_its_own_period():
+    made = started()
+    for i in range(MAX_RECORDS - 1):
+        made.add(message(i), 2.0)
+    assert made.next_timer() == 3.0 and made.closed(2.1, 0) == []
+    made.add(message(999), 2.2)
+    made.add(message(1000), 2.3)
+    assert made.next_timer() <= 2.3
+    (chunk,) = made.closed(2.3, 0)
+    assert read(chunk) == tuple(message(i) for i in range(MAX_RECORDS))
+    assert made.next_timer() == 3.3
+    assert [read(chunk) for chunk in made.closed(3.3, 0)] == [(message(1000),)]
+
+
+def test_a_chunk_is_closed_at_256_kib_of_json():
+    made = started()
+    lines = [message(i, 4096) for i in range(MAX_JSON // 4096)]
+    for line in lines[:-1]:
+        made.add(line, 2.0)
+    assert made.closed(2.1, 0) == []
+    made.add(lines[-1], 2.1)
+    made.add(b"rest", 2.1)
+    assert [read(chunk) for chunk in made.closed(2.1, 0)] == [tuple(lines)]
+
+
+def test_definitions_count_among_the_thousand_records():
+    made = writer()
+    for i in range(MAX_RECORDS + 500):
+        made.add(message(i), 0.1, type_name=f"t{i % 700}", definition_line=lambda i=i: b"type %d" % i)
+    chunks = [*made.closed(0.1, 0), *made.finish(0)]
+    lines = [read(chunk) for chunk in chunks]
+    # a definition and its message stay together: 1 + 2 * 499 lines, then 2 * 201 + 598, then what is left of 2201
+    assert [len(group) for group in lines] == [999, MAX_RECORDS, 202]
+    assert [line for group in lines for line in group if line.startswith(b"{")][1:] == [message(i) for i in range(1500)]
+
+
+def test_many_lines_at_once_become_several_chunks():
+    made = started()
+    for i in range(2500):
+        made.add(message(i), 2.0)
+    chunks = made.closed(2.0, 0)
+    assert [chunk.header.records for chunk in chunks] == [1000, 1000]
+    assert [chunk.header.records for chunk in made.closed(3.0, 0)] == [500]
+
+
+def test_silence_is_a_chunk_without_records_every_heartbeat():
+    made = started(heartbeat=60.0)
+    assert made.next_timer() == 61.0 and made.closed(60.9, 0) == []
+    (silent,) = made.closed(61.0, 77)
+    assert (silent.header.records, silent.body, silent.header.goodbye, silent.header.sealed_ms) == (0, b"", False, 77)
+    verify(LOG, ROBOT.public_key, silent)
+    assert made.next_timer() == 121.0
+    made.add(message(0), 100.0)
+    (chunk,) = made.closed(101.0, 0)
+    assert chunk.header.previous == silent.header.digest and made.next_timer() == 161.0
+
+
+def test_a_machine_that_slept_seals_one_heartbeat_and_not_one_an_hour():
+    made = started(heartbeat=60.0)
+    assert len(made.closed(1e6, 0)) == 1 and made.next_timer() == 1e6 + 60
+
+
+@pytest.mark.parametrize("times", [{"period": 0.0}, {"heartbeat": 0.0}, {"period": -1.0}])
+def test_times_that_would_never_end_are_refused(times):
+    with pytest.raises(ValueError, match="above 0"):
+        writer(**times)
+
+
+@pytest.mark.parametrize(("wall", "sealed"), [(-5, 0), (10**30, MAX_TIME_MS - 1), (123, 123)])
+def test_a_mad_clock_does_not_stop_the_log(wall, sealed):
+    (chunk,) = writer().finish(wall)
+    assert chunk.header.sealed_ms == sealed and Chunk.parse(chunk.encoded) == chunk
+
+
+# What
+
+
+def test_a_definition_stands_before_the_first_message_of_its_type_and_once_a_stream():
+    made, asked = writer(), []
+
+    def definition(name: str) -> Any:
+        return lambda: asked.append(name) or f'{{"type":"{name}"}}'.encode()
+
+    for i, name in enumerate(("A", "A", "B", "A")):
+        made.add(message(i), 0.0, type_name=name, definition_line=definition(name))
+    made.add(b'{"lost":1}', 0.0)
+    (chunk,) = made.closed(1.0, 0)
+    kinds = [next(iter(json.loads(line))) for line in read(chunk)]
+    assert kinds == ["stream", "type", "n", "n", "type", "n", "n", "lost"]
+    made.add(message(9), 1.1, type_name="A", definition_line=definition("A"))
+    assert [read(chunk) for chunk in made.closed(3.0, 0)] == [(message(9),)]
+    assert asked == ["A", "B"]
+
+
+def test_a_new_stream_says_its_start_and_definitions_again_and_takes_the_lines_that_wait():
+    made, asked = writer(), []
+    first = made.stream
+    made.add(message(0), 0.0, type_name="A", definition_line=lambda: asked.append(1) or b"type A")
+    (sealed,) = made.closed(1.0, 0)
+    made.add(message(1), 1.0, type_name="A")
+    made.new_stream()
+    made.add(message(2), 1.1, type_name="A")
+    (chunk,) = made.closed(2.0, 0)
+    assert made.stream == chunk.header.stream != first == sealed.header.stream
+    assert read(chunk) == (STREAM_LINE, b"type A", message(1), message(2))
+    check_links([sealed, chunk])
+    assert asked == [1]
+
+
+def test_a_new_stream_with_nothing_to_say_still_begins():
+    made = started()
+    made.new_stream()
+    (chunk,) = made.closed(2.0, 0)
+    assert read(chunk) == (STREAM_LINE,) and chunk.header.number == 0
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_what_does_not_fit_one_body_is_cut_and_nothing_is_lost(compress):
+    made = started(compress=compress)
+    lines = [noise(i, 6000) for i in range(44)]
+    for line in lines:
+        made.add(line, 2.0)
+    chunks = made.closed(2.0, 5) + made.finish(5)
+    assert len(chunks) > 4 and all(len(chunk.body) <= MAX_BODY for chunk in chunks)
+    assert [line for chunk in chunks for line in read(chunk)] == lines
+    assert [chunk.header.number for chunk in chunks] == list(range(1, len(chunks) + 1))
+    assert [chunk.header.goodbye for chunk in chunks] == [False] * (len(chunks) - 1) + [True]
+
+
+def test_the_longest_lines_fit_and_a_longer_one_is_refused_and_changes_nothing():
+    made = writer()
+    made.add(noise(0, MAX_LINE), 0.0, type_name="A", definition_line=lambda: noise(1, MAX_LINE))
+    with pytest.raises(TooLarge):
+        made.add(noise(2, MAX_LINE + 1), 0.0)
+    with pytest.raises(TooLarge):
+        made.add(b"line", 0.0, type_name="B", definition_line=lambda: noise(2, MAX_LINE + 1))
+    for bad in (b"", b"two\nlines"):
+        with pytest.raises(ValueError, match="newline"):
+            made.add(bad, 0.0)
+    with pytest.raises(ValueError, match="definition"):
+        made.add(b"line", 0.0, type_name="B")
+    with pytest.raises(TooLarge):
+        writer(stream_line=noise(1, MAX_LINE + 1))
+    assert [line for chunk in made.finish(0) for line in read(chunk)] == [
+        STREAM_LINE, noise(1, MAX_LINE), noise(0, MAX_LINE)
+    ]  # fmt: skip
+
+
+def test_goodbye_is_said_last_and_once_even_with_nothing_to_say():
+    made = writer()
+    made.add(message(0), 0.0)
+    (only,) = made.finish(0)
+    assert only.header.goodbye and read(only) == (STREAM_LINE, message(0))
+    (silent,) = started().finish(9)
+    assert silent.header.goodbye and silent.header.records == 0 and silent.header.number == 1
+    verify(LOG, ROBOT.public_key, silent)
+    many = started()
+    for i in range(2100):
+        many.add(message(i), 2.0)
+    assert [chunk.header.goodbye for chunk in many.finish(0)] == [False, False, True]
+
+
+# Links and keys
+
+
+def test_the_first_chunk_names_the_last_one_of_the_run_before():
+    before = writer().finish(0)
+    after = writer(previous=before[-1].header.digest)
+    check_links([*before, *after.closed(1.0, 0), *after.finish(0)])
+
+
+steps = st.lists(
+    st.one_of(
+        st.tuples(st.just("add"), st.integers(1, 3000), st.sampled_from([None, "A", "B"])),
+        st.tuples(st.just("wait"), st.floats(0.01, 5.0), st.none()),
+        st.tuples(st.just("new"), st.just(0), st.none()),
+    ),
+    max_size=40,
+)
+
+
+@given(steps, st.booleans())
+@settings(max_examples=60)
+def test_whatever_happens_the_log_is_linked_and_says_everything_once_in_order(steps, compress):
+    made, now, chunks, said = writer(compress=compress, heartbeat=3.0, randomness=repeating()), 0.0, [], []
+    for i, (what, size, name) in enumerate(steps):
+        if what == "add":
+            line = b'{"n":%d,"' % i + noise(i, size) + b'"}'
+            made.add(line, now, type_name=name, definition_line=lambda name=name: f"type {name}".encode())
+            said.append((line, name))
+        elif what == "wait":
+            now += size
+            chunks += made.closed(now, int(now * 1000))
+            assert made.next_timer() > now
+        else:
+            made.new_stream()
+    chunks += made.finish(int(now * 1000))
+    check_links(chunks)
+    assert [chunk.header.goodbye for chunk in chunks] == [False] * (len(chunks) - 1) + [True]
+    found, defined, stream = [], set(), None
+    for chunk in chunks:
+        for place, line in enumerate(read(chunk)):
+            if chunk.header.stream != stream:
+                assert line == STREAM_LINE and place == chunk.header.number == 0
+                stream, defined = chunk.header.stream, set()
+            elif line.startswith(b"type "):
+                assert line not in defined
+                defined.add(line)
+            else:
+                name = said[len(found)][1]
+                assert name is None or f"type {name}".encode() in defined
+                found.append(line)
+    assert found == [line for line, _ in said]
+
+
+def test_two_copies_of_a_robot_with_one_random_source_never_share_a_key():
+    """A machine restored from a snapshot, or a process that forked: everything is the same but what is captured."""
+    original = writer(randomness=repeating())
+    original.add(message(0), 0.0)
+    copied = copy.deepcopy(original)
+    chunks = []
+    for i, fork in enumerate((original, copied)):
+        fork.add(message(100 + i), 0.5)
+        chunks.append(fork.closed(1.0, 1000))
+        fork.add(message(7), 2.0)  # from here on both say the same
+        chunks[-1] += fork.finish(2000)
+    first, second = chunks
+    assert [c.header.stream for c in first] == [c.header.stream for c in second]
+    contents: dict[bytes, set[tuple[bytes, ...]]] = {}
+    for chunk in first + second:
+        contents.setdefault(content_key(chunk.header, READER), set()).add(read(chunk))
+    assert all(len(lines) == 1 for lines in contents.values()) and len(contents) >= 3
+
+
+def test_two_starts_with_one_random_source_never_share_a_key():
+    keys = set()
+    for i in range(2):
+        made = writer(randomness=lambda size: bytes(size))
+        made.add(message(i), 0.0)
+        keys.add(content_key(made.finish(0)[0].header, READER))
+    assert len(keys) == 2
+
+
+def test_a_repr_shows_no_line():
+    made = writer()
+    made.add(b"secret", 0.0)
+    assert "secret" not in repr(made) and "1 lines" in repr(made)
