@@ -1,0 +1,84 @@
+"""Coverage-guided fuzzing of what reads the bytes of others in the bridge; needs the package `atheris`.
+
+Invariant, for every reader below and any bytes whatever:
+
+1. it returns a value or raises its own error: no other exception, no hang;
+2. what it returned is written again as exactly the bytes that were read, where there is one encoding.
+
+    python fuzz/bridge_parsers.py -max_total_time=60 [CORPUS]
+
+Without atheris tests/bridge/log/test_fuzz.py checks the same with random alterations of valid input. Apart from
+parsers.py, which is the library's and knows no bridge.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from rosbridge_eth import chunk as chunks
+from rosbridge_eth.chunk import Chunk, ChunkError, Header
+from rosbridge_eth.protocol import ProtocolError, decode_down, decode_up, encode
+from smcrypto import sm2
+
+_LOG = chunks.Log(b"l" * 32, b"t" * 32)
+KEY = sm2.PrivateKey.from_int(1000)
+PLACE = chunks.seal(
+    _LOG, KEY, [], stream=bytes(16), number=0, previous=bytes(32), sealed_ms=0, readers=[]
+).header  # fmt: skip
+
+
+def _require(holds: bool, what: str) -> None:
+    if not holds:
+        raise RuntimeError(f"invariant broken: {what}")
+
+
+def _header(data: bytes) -> None:
+    header = Header.parse(data)
+    _require(header.encoded == data and len(data) <= chunks.MAX_HEADER, "header")
+    _require((header.records == 0) == (header.body_length == 0) == (not header.grants), "records, body and grants")
+    try:
+        chunks.content_key(header, KEY)
+    except ChunkError:
+        return
+
+
+def _chunk(data: bytes) -> None:
+    chunk = Chunk.parse(data)
+    _require(chunk.encoded == data, "chunk")
+    chunks.verify(_LOG, KEY.public_key, chunk)
+
+
+def _plaintext(data: bytes) -> None:
+    lines = chunks._unpack(PLACE, data)
+    _require(0 < len(lines) <= chunks.MAX_RECORDS and all(lines), "records")
+    _require(sum(map(len, lines)) < chunks.MAX_PLAINTEXT and not any(b"\n" in line for line in lines), "lines")
+
+
+def _up(data: bytes) -> None:
+    _require(encode(decode_up(data)) == data, "a robot's message")
+
+
+def _down(data: bytes) -> None:
+    _require(encode(decode_down(data)) == data, "a server's message")
+
+
+READERS: tuple[Callable[[bytes], None], ...] = (_header, _chunk, _plaintext, _up, _down)
+
+
+def check(data: bytes) -> None:
+    """One input: its first byte chooses the reader."""
+    if not data:
+        return
+    try:
+        READERS[data[0] % len(READERS)](data[1:])
+    except (ChunkError, ProtocolError):
+        return
+
+
+if __name__ == "__main__":
+    import atheris
+
+    atheris.instrument_all()
+    atheris.Setup(sys.argv, check)
+    atheris.Fuzz()
