@@ -32,6 +32,7 @@ URI_PREFIX = "urn:rosbridge-eth:"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _PURPOSE = re.compile(r"[a-z][a-z-]*\Z")
 
+_CA_LIFE, _LIFE = timedelta(days=3650), timedelta(days=825)
 _BACKDATED = timedelta(days=1)
 """Certificates begin so long before they are made, so that a chain or a robot whose clock is behind does no harm."""
 
@@ -58,10 +59,6 @@ class UntrustedCertificate(IdentityError):
 
 class ExpiredCertificate(UntrustedCertificate):
     """A certificate is not valid yet, or not any more."""
-
-
-class RevokedCertificate(UntrustedCertificate):
-    """A certificate stands in a revocation list of its issuer."""
 
 
 class WrongRole(UntrustedCertificate):
@@ -198,24 +195,17 @@ def _apart(signing: Collection[str] | None, encryption: Collection[str] | None) 
 
 @dataclass(frozen=True, slots=True)
 class Trust:
-    """Whom to believe: the operator's roots, intermediates and revocation lists, and who is on the allow list.
+    """Whom to believe: whom the operator's CA certified, and who is on the allow list.
 
     allowed: called with a peer whose certificates are good; False refuses it.
     None allows everybody with a good certificate.
     """
 
     roots: Sequence[x509.Certificate]
-    intermediates: Sequence[x509.Certificate] = ()
     allowed: Callable[[PeerIdentity], bool] | None = None
-    crls: Sequence[x509.CertificateRevocationList] = ()
 
     def check(
-        self,
-        signing_der: bytes,
-        encryption_der: bytes,
-        *,
-        role: Role | Iterable[Role],
-        name: str | None = None,
+        self, signing_der: bytes, encryption_der: bytes, *, role: Role | Iterable[Role], name: str | None = None,
         at: datetime,
     ) -> PeerIdentity:
         """Who the two certificates (DER) say they are, if all of it holds at `at` (aware UTC).
@@ -243,18 +233,11 @@ class Trust:
         for certificate, usage in ((signing, ("digitalSignature",)), (encryption, ("keyAgreement",))):
             try:
                 x509.verify_chain(
-                    certificate,
-                    intermediates=self.intermediates,
-                    roots=self.roots,
-                    at=at,
+                    certificate, roots=self.roots, at=at, key_usage=usage,
                     extended_key_usage=_extended_key_usage(peer.role),
-                    key_usage=usage,
-                    crls=self.crls,
                 )
             except CertificateError as error:
-                revoked = isinstance(error, x509.CertificateRevokedError)
-                kind = RevokedCertificate if revoked else UntrustedCertificate
-                raise kind(f"the certificate of {peer} is not to be trusted: {error}") from error
+                raise UntrustedCertificate(f"the certificate of {peer} is not to be trusted: {error}") from error
         if not _apart(signing.key_usage, encryption.key_usage):
             raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
         return peer
@@ -283,17 +266,11 @@ class Trust:
 # Creating identities
 
 
-def create_ca(
-    name: str,
-    *,
-    at: datetime,
-    valid_for: timedelta = timedelta(days=3650),
-    key: sm2.PrivateKey | None = None,
-) -> CertificateAuthority:
-    """A new CA whose certificate says CN=`name`; it can issue to identities only, not to other CAs."""
-    key = key or sm2.PrivateKey.generate()
+def create_ca(name: str, *, at: datetime) -> CertificateAuthority:
+    """A new CA for ten years, whose certificate says CN=`name`; it certifies identities only, not other CAs."""
+    key = sm2.PrivateKey.generate()
     certificate = x509.self_signed(
-        key, subject={"CN": name}, not_before=at - _BACKDATED, not_after=at + valid_for, ca=True, path_length=0
+        key, subject={"CN": name}, not_before=at - _BACKDATED, not_after=at + _CA_LIFE, ca=True, path_length=0
     )
     return CertificateAuthority(key, certificate)
 
@@ -336,14 +313,8 @@ def requests(
 
 
 def enrol_requests(
-    ca: CertificateAuthority,
-    role: Role,
-    name: str,
-    signing_request: x509.CertificateSigningRequest,
-    encryption_request: x509.CertificateSigningRequest,
-    *,
-    at: datetime,
-    valid_for: timedelta = timedelta(days=825),
+    ca: CertificateAuthority, role: Role, name: str, signing_request: x509.CertificateSigningRequest,
+    encryption_request: x509.CertificateSigningRequest, *, at: datetime,
 ) -> PeerIdentity:
     """Certificates for `role` and `name` over the keys of two requests; they begin a day before `at`.
 
@@ -364,7 +335,7 @@ def enrol_requests(
                 ca.certificate,
                 ca.key,
                 not_before=max(at - _BACKDATED, ca.certificate.not_before),
-                not_after=min(at + valid_for, ca.certificate.not_after),
+                not_after=min(at + _LIFE, ca.certificate.not_after),
                 key_usage=usage,
                 extended_key_usage=(_extended_key_usage(Role(role)),),
                 subject_alt_names=("URI:" + uri(role, name),),
@@ -375,23 +346,10 @@ def enrol_requests(
     return PeerIdentity(Role(role), name, *certificates)
 
 
-def enrol(
-    ca: CertificateAuthority,
-    role: Role,
-    name: str,
-    *,
-    at: datetime,
-    valid_for: timedelta = timedelta(days=825),
-    signing_key: sm2.PrivateKey | None = None,
-    encryption_key: sm2.PrivateKey | None = None,
-) -> Identity:
-    """A new identity with two fresh keys (or the given ones) and their certificates."""
-    signing_key = signing_key or sm2.PrivateKey.generate()
-    encryption_key = encryption_key or sm2.PrivateKey.generate()
-    signing_request, encryption_request = requests(name, signing_key, encryption_key)
-    peer = enrol_requests(
-        ca, role, name, signing_request, encryption_request, at=at, valid_for=valid_for
-    )
+def enrol(ca: CertificateAuthority, role: Role, name: str, *, at: datetime) -> Identity:
+    """A new identity with two fresh keys and their certificates."""
+    signing_key, encryption_key = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
+    peer = enrol_requests(ca, role, name, *requests(name, signing_key, encryption_key), at=at)
     return Identity(
         peer.role, name, signing_key, peer.signing_certificate, encryption_key, peer.encryption_certificate
     )

@@ -6,67 +6,91 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from eth_utils.crypto import keccak
 
+from rosbridge_eth import identity as ids
+from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import IdentityError, StoreError
-from rosbridge_eth.registry import Enrolment, Registry
+from rosbridge_eth.identity import PeerIdentity, Role, create_ca
+from rosbridge_eth.registry import Registry
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
+
+
+CA = create_ca("CA", at=NOON)
 
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     """As `init` leaves it."""
     made = Registry(tmp_path / "registry.sqlite", new=True)
-    for mark, role, name in ((254, "server", "server"), (255, "reader", "owner")):
-        enrol(made, name, mark, role=role)
+    for role, name in ((Role.SERVER, "server"), (Role.READER, "owner")):
+        enrol(made, name, role=role)
     return made
 
 
-def enrol(registry: Registry, name: str, mark: int, *, role: str = "robot", replace: bool = False) -> Enrolment:
-    return registry.enrol(
-        number=registry.next_number(), role=role, name=name, fingerprint=bytes([mark]) * 32,
-        certificates=b"pem", account=f"0x{mark}", now=NOON, replace=replace,
-    )
+def enrol(registry: Registry, name: str, *, role: Role = Role.ROBOT, replace: bool = False) -> PeerIdentity:
+    peer = ids.enrol(CA, role, name, at=NOON).public
+    registry.enrol(peer, NOON, account="0x1", replace=replace)
+    return peer
 
 
 def test_an_enrolled_certificate_is_allowed_and_no_other(registry: Registry) -> None:
-    enrol(registry, "robot_1", 1)
-    assert registry.allows("robot", "robot_1", b"\x01" * 32)
-    assert not registry.allows("robot", "robot_1", b"\x02" * 32)
-    assert not registry.allows("reader", "robot_1", b"\x01" * 32)
-    assert not registry.allows("robot", "robot_2", b"\x01" * 32)
+    peer = enrol(registry, "robot_1")
+    assert registry.allows(peer)
+    for other in (("robot_1", Role.ROBOT), ("robot_1", Role.READER), ("robot_2", Role.ROBOT)):
+        assert not registry.allows(ids.enrol(CA, other[1], other[0], at=NOON).public)
 
 
 def test_a_used_name_needs_replace_which_revokes_the_old(registry: Registry) -> None:
-    enrol(registry, "robot_1", 1)
+    old = enrol(registry, "robot_1")
     with pytest.raises(IdentityError, match="--replace"):
-        enrol(registry, "robot_1", 2)
-    assert registry.allows("robot", "robot_1", b"\x01" * 32)
-    enrol(registry, "robot_1", 2, replace=True)
-    assert not registry.allows("robot", "robot_1", b"\x01" * 32)
-    assert registry.allows("robot", "robot_1", b"\x02" * 32)
+        enrol(registry, "robot_1")
+    assert registry.allows(old)
+    new = enrol(registry, "robot_1", replace=True)
+    assert not registry.allows(old)
+    assert registry.allows(new)
     assert [found.revoked_at for found in registry.all("robot")] == [NOON, None]
 
 
+def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
+    enrol(registry, "robot_1")
+    second = enrol(registry, "robot_2")
+    newest = enrol(registry, "robot_1", replace=True)
+    registry.revoke(Role.ROBOT, "robot_2", NOON)
+    assert registry.names() == {robot_id("robot_1"): "robot_1", robot_id("robot_2"): "robot_2"}
+    robots = registry.robots()
+    assert {tk: (robot.number, robot.revoked_at) for tk, robot in robots.items()} == {
+        robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON),
+    }
+    assert registry.certificates_hash("robot_1") == keccak(newest.certificates)
+    assert registry.certificates_hash("robot_2") is None and robots[robot_id("robot_2")].hash == keccak(second.certificates)
+    assert [reader.name for reader in registry.readers()] == ["owner"]
+
+
 def test_numbers_are_never_used_twice(registry: Registry) -> None:
-    first = enrol(registry, "robot_1", 1)
+    enrol(registry, "robot_1")
+    first = registry.next_number()
     registry.revoke("robot", "robot_1", NOON)
-    assert enrol(registry, "robot_1", 2).number > first.number
+    enrol(registry, "robot_1")
+    assert registry.next_number() > first
 
 
 def test_a_revoked_name_is_free_again_and_not_revoked_twice(registry: Registry) -> None:
-    enrol(registry, "robot_1", 1)
-    registry.revoke("robot", "robot_1", NOON)
-    assert not registry.allows("robot", "robot_1", b"\x01" * 32)
-    with pytest.raises(IdentityError, match="no robot 'robot_1'"):
-        registry.revoke("robot", "robot_1", NOON)
+    peer = enrol(registry, "robot_1")
+    assert registry.revoke("robot", "robot_1", NOON)
+    assert not registry.allows(peer)
+    assert not registry.revoke("robot", "robot_1", NOON)
+    enrol(registry, "robot_1")
 
 
 def test_another_process_sees_a_revocation(registry: Registry, tmp_path: Path) -> None:
-    enrol(registry, "robot_1", 1)
-    other = Registry(tmp_path / "registry.sqlite")
-    registry.revoke("robot", "robot_1", NOON)
-    assert not other.allows("robot", "robot_1", b"\x01" * 32)
+    peer = enrol(registry, "robot_1")
+    with Registry(tmp_path / "registry.sqlite") as other:
+        before = other.revision()
+        registry.revoke("robot", "robot_1", NOON)
+        assert other.revision() != before
+        assert not other.allows(peer)
 
 
 def test_a_file_that_is_no_database_is_refused_with_the_way_out(tmp_path: Path) -> None:
@@ -77,7 +101,7 @@ def test_a_file_that_is_no_database_is_refused_with_the_way_out(tmp_path: Path) 
 
 @pytest.mark.parametrize("harm", ["deleted", "emptied", "made anew", "of another robot"])
 def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry, tmp_path: Path, harm: str) -> None:
-    enrol(registry, "robot_1", 1)
+    enrol(registry, "robot_1")
     registry.close()
     path = tmp_path / "registry.sqlite"
     path.unlink()
@@ -86,7 +110,7 @@ def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry,
     if harm in ("made anew", "of another robot"):
         made = Registry(path, new=True)
         if harm == "of another robot":
-            enrol(made, "robot_4", 4)
+            enrol(made, "robot_4")
         made.close()
     with pytest.raises(StoreError, match=r"restore registry\.sqlite from your backup"):
         Registry(path)
@@ -94,7 +118,7 @@ def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry,
 
 
 def test_a_home_whose_server_and_owner_were_replaced_has_its_registry_still(registry: Registry, tmp_path: Path) -> None:
-    enrol(registry, "server", 7, role="server", replace=True)
+    enrol(registry, "server", role=Role.SERVER, replace=True)
     registry.revoke("reader", "owner", NOON)
     registry.close()
     Registry(tmp_path / "registry.sqlite").close()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.errors import ExitCode, IdentityError
+from rosbridge_eth.errors import ExitCode, IdentityError, VerificationError
 from smcrypto import InvalidSignature, sm2, x509
 
 BIRTH = datetime(2026, 1, 1, tzinfo=UTC)
@@ -29,8 +29,34 @@ def ders(who: ids.Identity) -> tuple[bytes, bytes]:
 def test_an_enrolled_identity_is_who_it_says():
     peer = TRUST.check(*ders(ROBOT), role=ids.Role.ROBOT, name="robot_1", at=TODAY)
     assert (peer.role, peer.name) == (ids.Role.ROBOT, "robot_1")
-    assert len(peer.robot_id) == 32
     assert "CN=robot_1" in str(peer.signing_certificate.subject)
+
+
+def test_certificates_begin_a_day_before_they_are_made_and_never_before_their_ca():
+    for certificate in (CA.certificate, ROBOT.signing_certificate, ROBOT.encryption_certificate):
+        assert certificate.not_before == BIRTH - timedelta(days=1)
+    TRUST.check(*ders(ROBOT), role=ids.Role.ROBOT, at=BIRTH - timedelta(hours=23))
+    early = ids.enrol(CA, ids.Role.ROBOT, "robot_2", at=BIRTH - timedelta(hours=1))
+    assert early.public.not_before == BIRTH - timedelta(days=1)
+
+
+def test_certificates_of_a_registration_are_taken_apart_again():
+    together = ROBOT.public.certificates
+    assert ids.split_certificates(together) == ders(ROBOT)
+    for wrong in (b"", together[:-1], together + b"\0", ders(ROBOT)[0], ders(ROBOT)[0] * 3, b"\x30\x82\xff\xff" * 2):
+        with pytest.raises(VerificationError):
+            ids.split_certificates(wrong)
+
+
+def test_a_pem_file_names_its_identity():
+    assert ids.public_identity(ROBOT.public.pem) == ROBOT.public
+    other = ids.enrol(CA, ids.Role.ROBOT, "robot_2", at=BIRTH).public.pem
+    for wrong in (b"", ROBOT.public.pem + other, CA.certificate.to_pem(), CA.certificate.to_pem() * 2):
+        with pytest.raises(IdentityError):
+            ids.public_identity(wrong)
+    with pytest.raises(IdentityError, match="two identities"):
+        ids.public_identity(ROBOT.signing_certificate.to_pem() + other.split(b"-----END CERTIFICATE-----\n")[1]
+                            + b"-----END CERTIFICATE-----\n")
 
 
 @pytest.mark.parametrize(
@@ -39,7 +65,7 @@ def test_an_enrolled_identity_is_who_it_says():
         ({"role": ids.Role.SERVER}, ids.WrongRole),
         ({"role": (ids.Role.READER, ids.Role.OPERATOR)}, ids.WrongRole),
         ({"name": "robot_2"}, ids.WrongName),
-        ({"at": BIRTH - timedelta(seconds=1)}, ids.ExpiredCertificate),
+        ({"at": BIRTH - timedelta(days=1, seconds=1)}, ids.ExpiredCertificate),
         ({"at": BIRTH + timedelta(days=826)}, ids.ExpiredCertificate),
     ],
 )
@@ -101,20 +127,6 @@ def test_who_is_not_on_the_allow_list_is_refused():
         replace(TRUST, allowed=lambda peer: peer.name != "robot_1").check(*ders(ROBOT), role=ids.Role.ROBOT, at=TODAY)
 
 
-def test_who_is_on_the_revocation_list_is_refused():
-    for certificate in (ROBOT.signing_certificate, ROBOT.encryption_certificate):
-        crl = x509.CertificateRevocationList.create(
-            CA.certificate,
-            CA.key,
-            revoked=[x509.RevokedCertificate(certificate.serial_number, BIRTH)],
-            this_update=BIRTH,
-            next_update=TODAY + timedelta(days=1),
-            number=1,
-        )
-        with pytest.raises(ids.RevokedCertificate):
-            replace(TRUST, crls=(crl,)).check(*ders(ROBOT), role=ids.Role.ROBOT, at=TODAY)
-
-
 # Names
 
 
@@ -143,7 +155,7 @@ def test_a_signature_holds_for_its_purpose_body_and_key_alone():
     assert len(signature) == 64
     ids.verify(key.public_key, "record", b"body", signature)
     # The covered bytes are fixed: what a reader in another language would verify.
-    key.public_key.verify(signature, b"rosbridge-eth/1 record\0body", encoding="raw")
+    key.public_key.verify(signature, b"rosbridge-eth/2 record\0body", encoding="raw")
     for public, purpose, body, text in (
         (key.public_key, "gap", b"body", signature),
         (key.public_key, "record", b"other", signature),
@@ -160,6 +172,39 @@ def test_a_signature_holds_for_its_purpose_body_and_key_alone():
 def test_a_purpose_cannot_run_into_the_body(purpose):
     with pytest.raises(ValueError, match="purpose"):
         ids.sign(ROBOT.signing_key, purpose, b"")
+
+
+# The CA
+
+
+def test_a_ca_is_loaded_and_what_is_none_is_refused(tmp_path):
+    def put(key: sm2.PrivateKey, certificate: x509.Certificate, password: bytes = b"pass") -> None:
+        (tmp_path / "ca.crt.pem").write_bytes(certificate.to_pem())
+        (tmp_path / "ca.key.pem").unlink(missing_ok=True)
+        (tmp_path / "ca.key.pem").touch(0o600)
+        (tmp_path / "ca.key.pem").write_bytes(key.to_pem(password))
+
+    put(CA.key, CA.certificate)
+    loaded = ids.load_ca(tmp_path, b"pass", TODAY)
+    made = ids.enrol(loaded, ids.Role.ROBOT, "robot_3", at=TODAY)
+    TRUST.check(*ders(made), role=ids.Role.ROBOT, at=TODAY)
+    with pytest.raises(IdentityError, match="does not open"):
+        ids.load_ca(tmp_path, b"word", TODAY)
+    for at in (BIRTH - timedelta(days=2), BIRTH + timedelta(days=3651)):
+        with pytest.raises(IdentityError, match="is valid from"):
+            ids.load_ca(tmp_path, b"pass", at)
+    (tmp_path / "ca.key.pem").chmod(0o644)
+    with pytest.raises(IdentityError, match="chmod 600"):
+        ids.load_ca(tmp_path, b"pass", TODAY)
+    put(OTHER_CA.key, CA.certificate)
+    with pytest.raises(IdentityError, match="not the key of"):
+        ids.load_ca(tmp_path, b"pass", TODAY)
+    put(ROBOT.signing_key, ROBOT.signing_certificate)
+    with pytest.raises(IdentityError, match="not a CA's"):
+        ids.load_ca(tmp_path, b"pass", TODAY)
+    (tmp_path / "ca.crt.pem").unlink()
+    with pytest.raises(IdentityError, match="cannot be read"):
+        ids.load_ca(tmp_path, b"pass", TODAY)
 
 
 # Enrolment from requests, and files
