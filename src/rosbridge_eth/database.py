@@ -49,8 +49,9 @@ def _code(error: sqlite3.Error) -> int:
 class Database:
     """One file. An object belongs to one thread; open one per process, after forking.
 
-    what: "spool" or "inbox", for messages. application, schema: see SQLite's application_id, and what makes the
-    tables. wal_pages: how long the log grows; the reserve is twice that, for one transaction more. exclusive: no other process may have it; a damaged file, which then nobody else holds, is moved aside.
+    what: "spool" or "inbox", for messages. application: see SQLite's application_id. schema: makes the tables that
+    are not there. wal_pages: how long the log grows; the reserve is twice that, for one transaction more.
+    exclusive: no other process may have it; a damaged file, which then nobody else holds, is moved aside.
     read_only: nothing is made or changed; NothingThere if there is no file.
     StoreError if it is of another kind, version or edition, damaged, in use, or cannot be made.
     """
@@ -82,6 +83,7 @@ class Database:
             path.absolute().as_uri() + mode, uri=True, timeout=0.2 if exclusive or read_only else BUSY_TIMEOUT,
             isolation_level=None, check_same_thread=False,
         )  # fmt: skip
+        self._file = path.stat()
         try:
             self._open(application, schema, read_only)
         except BaseException:
@@ -96,8 +98,11 @@ class Database:
             found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]
             if found == 0 and self.one("SELECT count(*) FROM sqlite_master")[0] == 0 and not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
-                self.write(lambda: self._make(application, schema))
-                found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]
+                self._db.executescript(
+                    f"BEGIN IMMEDIATE; {schema} PRAGMA application_id = {application};"
+                    f" PRAGMA user_version = {VERSION}; COMMIT"
+                )
+                found, version = application, VERSION
             if found != application:
                 raise StoreError(f"{self.path} is no {self._what}; name another file")
             if version < VERSION:
@@ -114,17 +119,12 @@ class Database:
             if health != "ok":
                 raise sqlite3.DatabaseError(health)
 
-    def _make(self, application: int, schema: str) -> None:
-        if self.one("SELECT count(*) FROM sqlite_master")[0]:
-            return  # another process was faster
-        statement = ""
-        for line in schema.splitlines(keepends=True):
-            statement += line
-            if sqlite3.complete_statement(statement):
-                self._db.execute(statement)
-                statement = ""
-        self._db.execute(f"PRAGMA application_id = {application}")
-        self._db.execute(f"PRAGMA user_version = {VERSION}")
+    def replaced(self) -> bool:
+        """Whether the path leads to another file by now, or to none."""
+        try:
+            return not os.path.samestat(self._file, self.path.stat())
+        except FileNotFoundError:
+            return True
 
     def close(self) -> None:
         self._db.close()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosbridge_eth.chunk import Chunk, Log
-from rosbridge_eth.database import Database, DiskFull, InUse
+from rosbridge_eth.database import Database, DiskFull
 from rosbridge_eth.errors import StoreError
 
 _APPLICATION: Final = 0x52425350  # "RBSP"
@@ -29,31 +29,31 @@ _SPARE: Final = 64 * 1024  # bytes removed beyond a chunk's own on a full disk, 
 
 _SCHEMA: Final = """
 -- position: the order of the log. number: 8 bytes, big-endian, which order as they count. chunk: as it travels.
-CREATE TABLE chunk (
+CREATE TABLE IF NOT EXISTS chunk (
     position INTEGER PRIMARY KEY AUTOINCREMENT, stream BLOB NOT NULL, number BLOB NOT NULL, digest BLOB NOT NULL,
     records INTEGER NOT NULL, size INTEGER NOT NULL, state INTEGER NOT NULL, chunk BLOB NOT NULL,
     UNIQUE (stream, number)
 );
-CREATE INDEX chunk_by_state ON chunk (state, position);
+CREATE INDEX IF NOT EXISTS chunk_by_state ON chunk (state, position);
 -- Sums over the chunks in each state, kept by the triggers.
-CREATE TABLE held (state INTEGER PRIMARY KEY, chunks INTEGER, records INTEGER, bytes INTEGER);
-INSERT INTO held VALUES (2, 0, 0, 0), (3, 0, 0, 0), (4, 0, 0, 0), (5, 0, 0, 0);
-CREATE TRIGGER added AFTER INSERT ON chunk BEGIN
+CREATE TABLE IF NOT EXISTS held (state INTEGER PRIMARY KEY, chunks INTEGER, records INTEGER, bytes INTEGER);
+INSERT OR IGNORE INTO held VALUES (2, 0, 0, 0), (3, 0, 0, 0), (4, 0, 0, 0), (5, 0, 0, 0);
+CREATE TRIGGER IF NOT EXISTS added AFTER INSERT ON chunk BEGIN
     UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
     WHERE state = new.state;
 END;
-CREATE TRIGGER removed AFTER DELETE ON chunk BEGIN
+CREATE TRIGGER IF NOT EXISTS removed AFTER DELETE ON chunk BEGIN
     UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
     WHERE state = old.state;
 END;
-CREATE TRIGGER changed AFTER UPDATE ON chunk BEGIN
+CREATE TRIGGER IF NOT EXISTS changed AFTER UPDATE ON chunk BEGIN
     UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
     WHERE state = old.state;
     UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
     WHERE state = new.state;
 END;
 -- One row: whose log, the newest header ever appended, and what was dropped since the spool was made.
-CREATE TABLE spool (
+CREATE TABLE IF NOT EXISTS spool (
     ledger BLOB, tk BLOB, last BLOB, dropped_bodies INTEGER, dropped_headers INTEGER, dropped_records INTEGER
 );
 """
@@ -83,18 +83,23 @@ class Spool:
     """One robot's log, for one process and one thread. Every method may raise StoreError; then nothing was changed.
 
     max_bytes: the bound on the chunks as they travel; the file takes about a tenth more. drop: gives the dropped
-    form of a chunk, signed (chunk.drop). StoreError if the file is another log's, or see database.Database.
+    form of a chunk, signed (chunk.drop). read_only: for a look at its statistics; database.InUse while its robot
+    runs. StoreError if the file is another log's, or see database.Database.
     """
 
-    def __init__(self, path: Path, log: Log, *, max_bytes: int, drop: Callable[[Chunk], Chunk]) -> None:
+    def __init__(
+        self, path: Path, log: Log, *, max_bytes: int, drop: Callable[[Chunk], Chunk], read_only: bool = False
+    ) -> None:
         self._max_bytes, self._drop = max_bytes, drop
-        self._db = _open(path, exclusive=True)
+        self._db = Database(
+            path, "spool", application=_APPLICATION, schema=_SCHEMA, wal_pages=128, exclusive=True, read_only=read_only
+        )
         try:
+            if not read_only:
+                make = "INSERT INTO spool SELECT ?, ?, ?, 0, 0, 0 WHERE NOT EXISTS (SELECT 1 FROM spool)"
+                self._db.write(lambda: self._db.run(make, (*log, bytes(32))))
             with self._db.errors():
                 row = self._db.one("SELECT ledger, tk, last FROM spool")
-            if row is None:
-                row = (*log, bytes(32))
-                self._db.write(lambda: self._db.run("INSERT INTO spool VALUES (?, ?, ?, 0, 0, 0)", row))
             if row[:2] != log:
                 raise StoreError(
                     f"the spool {path} is another robot's, or for another contract; what it holds is signed for that"
@@ -226,38 +231,12 @@ class Spool:
         )
 
     def statistics(self) -> SpoolStatistics:
+        """What is in the spool at this moment."""
         with self._db.errors():
-            return _statistics(self._db)
-
-
-def peek(path: Path) -> SpoolStatistics | None:
-    """What a spool holds, asked without owning it: nothing is made, mended or moved. None while its robot runs.
-
-    NothingThere if there is none, StoreError if it cannot be read.
-    """
-    db: Database | None = None
-    try:
-        db = _open(path, read_only=True)
-        with db.errors():
-            return _statistics(db)
-    except InUse:
-        return None
-    finally:
-        if db is not None:
-            db.close()
-
-
-def _open(path: Path, *, exclusive: bool = False, read_only: bool = False) -> Database:
-    return Database(
-        path, "spool", application=_APPLICATION, schema=_SCHEMA, wal_pages=128, exclusive=exclusive, read_only=read_only
-    )
-
-
-def _statistics(db: Database) -> SpoolStatistics:
-    held = {row[0]: row[1:] for row in db.run("SELECT state, chunks, records, bytes FROM held")}
-    dropped = db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool") or (0, 0, 0)
-    chunks, records, size = map(sum, zip(*held.values(), strict=True))
-    return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
+            held = {row[0]: row[1:] for row in self._db.run("SELECT * FROM held")}
+            dropped = self._db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool")
+        chunks, records, size = map(sum, zip(*held.values(), strict=True))
+        return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
 
 
 def _sortable(number: int) -> bytes:

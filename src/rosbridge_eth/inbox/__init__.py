@@ -1,13 +1,15 @@
 """The server's replica of the robots' logs: what was taken from robots, in the order of their logs on the chain.
 
-This is the protocol that both back ends keep, and its vocabulary; tests/bridge/inbox/test_conformance.py says what
-it means. A robot is named by its Tk. A *row* is a chunk at a position; positions order a robot's rows and mean
-nothing else. Rows up to the robot's confirmed one are on the chain and kept for some time, so that the chain may
-still turn back; the others wait. `now` is the wall clock in seconds, shared by the processes that use one inbox.
+Here is what both back ends have in common; tests/bridge/inbox/test_conformance.py says what it means. A robot is
+named by its Tk. A *row* is a chunk at a position; positions order a robot's rows and mean nothing else. Rows up to
+the robot's confirmed one are on the chain and kept for some time, so that the chain may still turn back; the others
+wait. `now` is the wall clock in seconds, shared by the processes that use one inbox. Workers append; one submitter
+does the rest.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
@@ -16,10 +18,10 @@ from typing import Any, Final, NamedTuple, Protocol
 from rosbridge_eth.chunk import Chunk
 from rosbridge_eth.errors import StoreError
 
-MAX_STREAMS: Final = 4096
-"""Streams a robot whose heads are kept; beyond that the one that was written to least recently is forgotten."""
-DEAD_SHARE: Final = 8
-"""Dead letters take at most this part of max_bytes, on top of it; the oldest go."""
+DEAD_LETTERS: Final = 1000
+"""Dead letters that are kept; the oldest go."""
+_AT_ONCE: Final = 1000
+"""Rows of a robot that one transaction removes."""
 
 
 class InboxExchanged(StoreError):
@@ -58,12 +60,19 @@ class Row(NamedTuple):
 
 
 class RobotState(NamedTuple):
-    """confirmed: stream and number of the newest row that is confirmed on the chain. hold: why nothing is written
-    for this robot. certificates_hash: keccak256 of the certificates that the contract has for it."""
+    """What the submitter knows of a robot.
+
+    confirmed: stream and number of the newest row that is confirmed on the chain, and position: where it stands.
+    hold: why nothing is written for the robot. certificates_hash: keccak256 of the certificates that the contract
+    has for it. mark: the position that was confirmed at `marked_at`; what lies before it is removed a day later.
+    """
 
     confirmed: tuple[bytes, int] | None = None
     hold: str | None = None
     certificates_hash: bytes | None = None
+    position: int | None = None
+    mark: int | None = None
+    marked_at: float = 0.0
 
 
 class Waiting(NamedTuple):
@@ -92,10 +101,10 @@ class Inbox(Protocol):
 
     id: bytes
     """Random, made with the store: another id is another store."""
+    max_bytes: int
+    max_bytes_per_robot: int
 
-    def head(self, tk: bytes, stream: bytes) -> Head | None:
-        """The newest chunk of the stream that was ever taken; it outlives the row."""
-        ...
+    # What each back end does in its own way
 
     def append(self, chunks: Sequence[tuple[bytes, Chunk]], now: float) -> list[Outcome]:
         """Take chunks, (Tk, chunk) each, all in one commit; one outcome for each, in order. Also InboxExchanged.
@@ -103,27 +112,85 @@ class Inbox(Protocol):
         A chunk is taken if its number is above the head of its stream, and neither the robot's share nor the whole
         would be exceeded by it.
         """
-        ...
 
-    def robots(self) -> list[bytes]:
-        """All of whom there ever was a row or a state."""
-        ...
-
-    def find(self, tk: bytes, hash: bytes) -> int | None:
-        """The position of the row with this keccak256."""
-        ...
-
-    def rows(self, tk: bytes, after: int | None, limit: int) -> list[Row]:
-        """Up to `limit` rows behind a position (None: from the first), in order."""
-        ...
-
-    def chunks(self, tk: bytes, positions: Collection[int]) -> list[bytes]:
-        """The encoded chunks at these positions. StoreError if one is not there any more."""
-        ...
+    def head(self, tk: bytes, stream: bytes) -> Head | None:
+        """The newest chunk of the stream that was ever taken; it outlives the row."""
 
     def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head], now: float) -> None:
         """These chunks are on the chain: from now on nothing of these streams up to them is taken."""
-        ...
+
+    def sizes(self) -> dict[bytes, int]:
+        """Of every robot of which there ever was a row or a state, the bytes of its rows."""
+
+    def find(self, tk: bytes, hash: bytes) -> int | None:
+        """The position of the row with this keccak256."""
+
+    def rows(self, tk: bytes, after: int | None, limit: int) -> list[Row]:
+        """Up to `limit` rows behind a position (None: from the first), in order."""
+
+    def chunks(self, tk: bytes, positions: Collection[int]) -> list[bytes]:
+        """The encoded chunks at these positions. StoreError if one is not there any more."""
+
+    def remove(self, tk: bytes, positions: Collection[int], why: str | None = None) -> None:
+        """Remove rows; with a reason they become dead letters."""
+
+    def dead(self, limit: int = 100) -> list[DeadLetter]:
+        """Dead letters, the newest first."""
+
+    def waiting(self, tk: bytes, after: int | None) -> Waiting:
+        """The rows of a robot behind a position."""
+
+    def check(self) -> None:
+        """StoreError, with what to do, unless what is committed is kept and every right that is needed is there."""
+
+    def close(self) -> None:
+        """Let go of it."""
+
+    def _put_in_front(self, tk: bytes, tail: Chunk | None, on_chain: set[bytes], now: float) -> None:
+        """Remove the rows whose digest is in `on_chain`, then make `tail` the first row."""
+
+    def _load(self, tk: bytes) -> str | None:
+        """The text last given to `_save`, which need not outlive a power cut."""
+
+    def _save(self, tk: bytes, text: str) -> None:
+        """Keep a text about a robot."""
+
+    # What they have in common
+
+    def robots(self) -> list[bytes]:
+        """All of whom there ever was a row or a state."""
+        return list(self.sizes())
+
+    def state(self, tk: bytes) -> RobotState:
+        """What was set last, or nothing at all."""
+        text = self._load(tk)
+        if text is None:
+            return RobotState()
+        confirmed, hold, certificates_hash, *rest = json.loads(text)
+        return RobotState(
+            confirmed and (bytes.fromhex(confirmed[0]), confirmed[1]), hold,
+            certificates_hash and bytes.fromhex(certificates_hash), *rest,
+        )  # fmt: skip
+
+    def set_state(self, tk: bytes, **changes: Any) -> None:
+        """Change fields of the state, such as `hold`. A power cut may take it back."""
+        known = self.state(tk)
+        state = known._replace(**changes)
+        if state != known:
+            self._save(tk, json.dumps(state, default=bytes.hex))
+
+    def confirm(self, tk: bytes, position: int | None, now: float) -> None:
+        """The row there and all before it are confirmed on the chain, and none behind it. It may move back."""
+        known = self.state(tk)
+        if position is None:
+            self.set_state(tk, confirmed=None, position=None, mark=None)
+        elif position != known.position:
+            header = Chunk.parse(self.chunks(tk, [position])[0]).header
+            kept = known.mark is not None and known.mark <= position
+            self.set_state(
+                tk, confirmed=(header.stream, header.number), position=position,
+                mark=known.mark if kept else position, marked_at=known.marked_at if kept else now,
+            )  # fmt: skip
 
     def rebase(
         self, tk: bytes, tail: Chunk | None, on_chain: Collection[bytes], heads: Mapping[bytes, Head], now: float
@@ -131,49 +198,57 @@ class Inbox(Protocol):
         """Make the rows follow a chain whose last chunk, `tail`, is not among them (None: the chain has none).
 
         Rows whose digest is in `on_chain` go, `tail` becomes the first row, the others stay behind it in their
-        order; heads are raised; nothing is confirmed until `confirm` says so. Positions change. Whoever reads rows
-        to see which are on the chain calls `raise_heads` before: then none can be added meanwhile that is.
+        order, perhaps at other positions; heads are raised; nothing is confirmed until `confirm` says so. A caller
+        who reads rows to see which of them are on the chain calls `raise_heads` before: then none that is can be
+        added meanwhile.
         """
-        ...
-
-    def confirm(self, tk: bytes, position: int | None, now: float) -> None:
-        """The row there and all before it are confirmed on the chain, and none behind it. It may move back.
-
-        StoreError if no row is there. A power cut may take this and `forget` back.
-        """
-        ...
+        if tail is not None:
+            heads = {tail.header.stream: Head(tail.header.number, tail.header.digest), **heads}
+            on_chain = {*on_chain, tail.header.digest}
+        self.raise_heads(tk, heads, now)
+        self.confirm(tk, None, now)
+        self._put_in_front(tk, tail, set(on_chain), now)
 
     def forget(self, before: float) -> None:
-        """Remove rows that were confirmed before that time, and make room: while a robot's rows take more than half
-        of its share, or of its part of a store that is more than half full, its oldest confirmed ones go as well.
+        """Remove rows that were confirmed long before `before` (at most as long again), and make room.
 
-        A robot's newest confirmed row stays. To be called every minute or so.
+        While a robot's rows take more than half of its share, or of its part of a store that is more than half
+        full, its oldest confirmed ones go at once. A robot's newest confirmed row stays. To be called every minute
+        or so.
         """
-        ...
-
-    def state(self, tk: bytes) -> RobotState: ...
-
-    def set_state(self, tk: bytes, **changes: Any) -> None:
-        """Change fields of the state, `hold` or `certificates_hash`. A power cut may take it back."""
-        ...
+        sizes = self.sizes()
+        kept = self.max_bytes_per_robot // 2
+        if sum(sizes.values()) > self.max_bytes // 2:
+            kept = min(kept, self.max_bytes // len(sizes) // 2)
+        for tk, size in sizes.items():
+            state = self.state(tk)
+            aged = state.mark is not None and state.marked_at < before
+            gone: list[int] = []
+            for row in self.rows(tk, None, _AT_ONCE) if state.position is not None and (aged or size > kept) else ():
+                old = aged and state.mark is not None and row.position <= state.mark
+                if row.position == state.position or not (old or size > kept):
+                    break
+                gone.append(row.position)
+                size -= row.size
+            if gone:
+                self.remove(tk, gone)
+            if aged and len(gone) < _AT_ONCE:
+                self.set_state(tk, mark=state.position, marked_at=before)
 
     def bury(self, tk: bytes, after: int | None, why: str) -> int:
         """Rows behind a position (None: all) become dead letters; how many."""
-        ...
-
-    def dead(self, limit: int = 100) -> list[DeadLetter]:
-        """Dead letters, the newest first."""
-        ...
+        position = self.state(tk).position
+        if position is not None and (after is None or position > after):
+            self.confirm(tk, None, 0.0)
+        count = 0
+        while rows := self.rows(tk, after, _AT_ONCE):
+            self.remove(tk, [row.position for row in rows], why)
+            count += len(rows)
+        return count
 
     def totals(self) -> dict[bytes, Waiting]:
         """What waits, of every robot."""
-        ...
-
-    def check(self) -> None:
-        """StoreError, with what to do, unless what is committed is kept and every right that is needed is there."""
-        ...
-
-    def close(self) -> None: ...
+        return {tk: self.waiting(tk, self.state(tk).position) for tk in self.robots()}
 
 
 def open_inbox(
@@ -191,8 +266,3 @@ def open_inbox(
     from rosbridge_eth.inbox.redis import RedisInbox
 
     return RedisInbox(url, ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
-
-
-def kept_for(total: int, robots: int, max_bytes: int, share: int) -> int:
-    """Above how many bytes the confirmed rows of each robot go before their time."""
-    return (min(share, max_bytes // max(1, robots)) if total > max_bytes // 2 else share) // 2
