@@ -1,0 +1,103 @@
+"""Reading and proving a history: records a second, and what of it takes the time.
+
+    python benchmarks/bench_reading.py [--chunks 1000] [--records 100]
+
+The records are the sample's Odometry, all its fields; the chunks are sealed as a robot seals them, and read as the
+chain gives them, from memory: nodes and networks are not measured here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+import tracemalloc
+from datetime import UTC, datetime
+from itertools import cycle, islice
+
+from eth_utils.crypto import keccak
+
+from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
+from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
+from rosbridge_eth.identity import Role, Trust, create_ca, enrol
+from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
+from rosbridge_eth.reading.verify import Verifier, is_signed
+from rosbridge_eth.sources.bag import BagSettings, BagSource
+from rosbridge_eth.sources.sample import sample_bag
+from rosbridge_eth.sources.selection import Selection
+
+START = datetime(2026, 1, 1, tzinfo=UTC)
+T0_MS = round(START.timestamp() * 1000) + 3_600_000
+LEDGER, NAME, ACCOUNT = b"L" * 32, "robot_1", "0x" + "00" * 20
+
+
+def sample_lines() -> tuple[list[bytes], list[bytes]]:
+    """The lines that open a stream, and those of the sample's Odometry."""
+    source = BagSource(BagSettings(sample_bag()), Selection(["/robot_1/odom"]))
+    capture = Capture([TopicRule("/robot_1/odom")], source_kind="bag", notify=lambda notice: None)
+    captured = [found for raw in source.messages() if (found := capture.process(raw, T0_MS * 10**6, True))]
+    opening = [stream_line("bag", "rosbridge_eth 2.0"), definition_line(captured[0].decoder)]
+    return opening, [one.line for one in captured]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--chunks", type=int, default=1000)
+    parser.add_argument("--records", type=int, default=100)
+    arguments = parser.parse_args()
+    authority = create_ca("CA", at=START)
+    robot = enrol(authority, Role.ROBOT, NAME, at=START)
+    reader = enrol(authority, Role.READER, "owner", at=START).encryption_key
+    log, opening, lines = Log(LEDGER, robot_id(NAME)), *sample_lines()
+    endless, previous, chunks = cycle(lines), bytes(32), []
+    for number in range(arguments.chunks):
+        content = (opening if number == 0 else []) + list(islice(endless, arguments.records))
+        chunk = seal(
+            log, robot.signing_key, content, stream=b"s" * 16, number=number, previous=previous,
+            sealed_ms=T0_MS + 1000 * number, readers=[reader.public_key], goodbye=number == arguments.chunks - 1,
+        )  # fmt: skip
+        previous = chunk.header.digest
+        chunks.append(chunk)
+    encoded = [chunk.encoded for chunk in chunks]
+    certificates = robot.public.certificates
+    standing = Standing(ACCOUNT, keccak(certificates), False, len(encoded), keccak(encoded[-1]), 0, 9, 1)
+    registered = [RegistrationEvent(ACCOUNT, certificates, 0, 0, 1, False)]
+
+    def read() -> int:
+        verifier = Verifier(
+            NAME, LEDGER, standing, registered, trust=Trust([authority.certificate]), reader=reader, block=9,
+            block_time=lambda block: T0_MS // 1000 + arguments.chunks, now=T0_MS / 1000,
+        )  # fmt: skip
+        events = (DataEvent(at, 0, tuple(encoded[at : at + 8]), 9, b"", ACCOUNT) for at in range(0, len(encoded), 8))
+        records = sum(len(proven.records) for proven in verifier.read(events))
+        verdict = verifier.verdict()
+        if not verdict.sound or records != arguments.chunks * arguments.records:
+            raise SystemExit("\n".join(verdict.lines()))
+        return records
+
+    size = sum(map(len, encoded))
+    machine = f"{platform.machine()}, Python {platform.python_version()}"
+    print(f"{machine}: {len(encoded)} chunks of {arguments.records} records")
+    print(f"{size / arguments.chunks / arguments.records:8.1f} bytes a record on the chain")
+    for name in ("cold", "warm"):
+        begin = time.perf_counter()
+        records = read()
+        took = time.perf_counter() - begin
+        print(f"{records / took:8,.0f} records a second, {name}: {took / records * 1e6:.1f} us each, {took:.2f} s")
+    for name, step in (
+        ("signature", lambda chunk: is_signed(log, robot.signing_key.public_key, chunk)),
+        ("content key", lambda chunk: content_key(chunk.header, reader)),
+        ("both, and opening", lambda chunk: open_lines(log, chunk, content_key(chunk.header, reader))),
+    ):
+        begin = time.perf_counter()
+        for chunk in chunks[:200]:
+            step(chunk)
+        took = (time.perf_counter() - begin) / len(chunks[:200])
+        print(f"{took * 1e6:8,.0f} us a chunk: {name}")
+    tracemalloc.start()
+    read()
+    print(f"{tracemalloc.get_traced_memory()[1] / 2**20:8.1f} MiB at most while it reads")
+
+
+if __name__ == "__main__":
+    main()

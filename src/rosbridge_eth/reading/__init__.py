@@ -1,0 +1,19 @@
+"""The reader: from what a chain has of a robot to proven records, a verdict, and files."""
+
+from rosbridge_eth.reading.fetch import Reading, read_robot
+from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Finding, Kind, Verdict
+from rosbridge_eth.reading.verify import Place, ProvenChunk, ProvenRecord, Verifier
+
+__all__ = [
+    "Bookmark",
+    "Bookmarks",
+    "Finding",
+    "Kind",
+    "Place",
+    "ProvenChunk",
+    "ProvenRecord",
+    "Reading",
+    "Verdict",
+    "Verifier",
+    "read_robot",
+]

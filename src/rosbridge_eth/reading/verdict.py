@@ -1,0 +1,262 @@
+"""What a reading ends with: findings, the verdict, and the bookmark from which the next reading goes on.
+
+A violation says that the log on the chain is not what the robot wrote, or not all of it. A notice is true and
+worth knowing, and no breach. Whatever of a log is shown goes through `shown`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, NamedTuple
+
+from pydantic import BaseModel, Field, StringConstraints
+
+from rosbridge_eth.chunk import MAX_TIME_MS, Log
+from rosbridge_eth.config.values import duration_text, time_text
+from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.files import write_atomically
+
+MAX_FINDINGS: Final = 500
+"""Findings kept one by one; what is above that is counted by kind."""
+MAX_SHOWN: Final = 120
+
+
+class Kind(Enum):
+    """A finding's name for programs, whether it is a violation, what its count counts, and what it says."""
+
+    MALFORMED = "malformed", True, "chunk", "not in the form of a chunk"
+    ALTERED = "altered", True, "chunk", "not what the robot sealed"
+    FORGED = "forged", True, "chunk", "not signed by the robot for this place"
+    ELSEWHERE = "elsewhere", True, "chunk", "signed by the robot for another ledger"
+    MISSING = "missing", True, "place", "the robot wrote more before this than the chain has"
+    FORKED = "forked", True, "place", "the robot's log branches here, or goes back"
+    UNTRUSTED = "untrusted", True, "chunk", "no certificate of this robot that is to be trusted governs this"
+    WITHHELD = "withheld", True, "chunk", "counted by the contract and not shown by the node"
+    ROLLED_BACK = "rolled-back", True, "place", "what an earlier reading found here is not here now"
+    UNOPENABLE = "unopenable", True, "chunk", "the signature holds and the content does not"
+    DROPPED = "dropped", False, "record", "dropped by the robot, whose disk was full"
+    LOST = "lost", False, "message", "not captured, says the robot"
+    RESTARTED = "restarted", False, "restart", "began anew without having said goodbye"
+    NEW_CERTIFICATE = "new-certificate", False, "certificate", "not known to this reader: compare its fingerprint"
+    NO_GRANT = "no-grant", False, "record", "not for this reader"
+    CLOCK = "clock", False, "time", "the robot's clock was not right"
+
+    def __init__(self, label: str, violation: bool, unit: str, meaning: str) -> None:
+        self.label, self.violation, self.unit, self.meaning = label, violation, unit, meaning
+
+    def counted(self, count: int) -> str:
+        return f"{count:,} {self.unit}{'' if count == 1 else 's'}"
+
+
+@dataclass(slots=True)
+class Finding:
+    """first, last: indices of chunks in the robot's log on the chain, both included. detail: safe to show."""
+
+    kind: Kind
+    first: int
+    last: int
+    count: int
+    detail: str
+
+    def __str__(self) -> str:
+        where = f"chunk {self.first}" if self.first == self.last else f"chunks {self.first} to {self.last}"
+        return f"{self.kind.label}: {where}: {self.kind.counted(self.count)}: {self.kind.meaning}" + (
+            f" ({self.detail})" if self.detail else ""
+        )
+
+
+class Findings:
+    """Collects findings in bounded memory: neighbours with one kind and detail are one, and so are equal notices."""
+
+    def __init__(self, before: Mapping[str, int]) -> None:
+        self.counts: Counter[str] = Counter(before)
+        self.kept: list[Finding] = []
+        self._latest: dict[tuple[Kind, str], Finding] = {}
+
+    def add(self, kind: Kind, first: int, last: int | None = None, *, count: int = 1, detail: str = "") -> None:
+        last = first if last is None else last
+        self.counts[kind.label] += count
+        known = self._latest.get((kind, detail))
+        if known is not None and (not kind.violation or first <= known.last + 1):
+            known.last, known.count = max(known.last, last), known.count + count
+        elif len(self.kept) < MAX_FINDINGS:
+            found = self._latest[kind, detail] = Finding(kind, first, last, count, detail)
+            self.kept.append(found)
+
+    @property
+    def sound(self) -> bool:
+        return not any(self.counts[kind.label] for kind in Kind if kind.violation)
+
+
+Hash = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+
+
+class Head(NamedTuple):
+    """The robot's newest chunk as the reading has it: what the next one has to follow."""
+
+    stream: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
+    number: int
+    digest: Hash
+    sealed_ms: Annotated[int, Field(ge=0, lt=MAX_TIME_MS)]
+    goodbye: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Bookmark:
+    """What a reader keeps of a robot's log, so that it cannot be shown another one, nor has to read all again.
+
+    count: chunks read. digest: hex of the last one's identity. block: of it, which a reorganisation may change.
+    fingerprints: certificates that were accepted. head, records, found, types: with what a reading goes on after
+    `count`; types are the lines of the definitions, by type name.
+    """
+
+    count: Annotated[int, Field(ge=0)]
+    digest: str
+    block: int = 0
+    fingerprints: tuple[str, ...] = ()
+    head: Head | None = None
+    records: int = 0
+    found: dict[str, int] = field(default_factory=dict)
+    types: dict[str, str] = field(default_factory=dict)
+
+
+class _File(BaseModel, strict=True, extra="forbid"):
+    """By ledger and robot, the bookmark."""
+
+    format: Literal[1] = 1
+    logs: dict[Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}/[0-9a-f]{64}$")], Bookmark] = {}
+
+
+class Bookmarks:
+    """A JSON file beside the reader's key: of each ledger and robot, the bookmark."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._file = path, _File()
+        try:
+            self._file = _File.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            pass
+        except (ValueError, OSError) as error:
+            raise ConfigError(
+                f"the bookmarks in {path} cannot be used ({shown(str(error))}); bring the file back from a copy:"
+                " without it a reading cannot know whether the log is the one that was read before"
+            ) from error
+
+    def get(self, log: Log) -> Bookmark | None:
+        return self._file.logs.get(_key(log))
+
+    def put(self, log: Log, bookmark: Bookmark) -> None:
+        self._file.logs[_key(log)] = bookmark
+        write_atomically(self._path, self._file.model_dump_json(indent=1).encode() + b"\n")
+
+    def other_ledgers(self, log: Log) -> list[bytes]:
+        """Ids of the other ledgers on which this reader has read the same robot."""
+        return [bytes.fromhex(key[:64]) for key in self._file.logs if key[65:] == log.tk.hex() and key != _key(log)]
+
+
+def _key(log: Log) -> str:
+    return f"{log.ledger.hex()}/{log.tk.hex()}"
+
+
+@dataclass(frozen=True, slots=True)
+class Governing:
+    """A registration or revocation, and from which chunk on it holds. fingerprint: SM3 of the signing certificate."""
+
+    first: int
+    block: int
+    account: str
+    fingerprint: str
+    revoked: bool
+    trusted: bool
+    new: bool
+
+    def __str__(self) -> str:
+        if self.revoked:
+            return f"revoked from chunk {self.first} on, in block {self.block}"
+        remarks = ("" if self.trusted else ", NOT TRUSTED") + (", NEW to this reader" if self.new else "")
+        return f"from chunk {self.first} on, in block {self.block}: {grouped(self.fingerprint)}{remarks}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How a reading ended. What is counted is counted since the first chunk, over all readings that the bookmark links.
+
+    chunks: how many the contract counts. block: up to which the chain was looked at. records: opened and proven.
+    head: the newest chunk that is the robot's; None where there is none. silent: it is older than the heartbeat, and
+    the robot has not said goodbye. nodes: what other nodes said otherwise.
+    """
+
+    robot: str
+    sound: bool
+    chunks: int
+    block: int
+    head: Head | None
+    records: int
+    counts: Mapping[str, int]
+    certificates: tuple[Governing, ...]
+    silent: bool
+    heartbeat: float
+    findings: tuple[Finding, ...]
+    nodes: tuple[str, ...] = ()
+
+    def lines(self) -> Iterator[str]:
+        """For a person. Nothing in them can act on a terminal."""
+        sound = "sound" if self.sound else "NOT SOUND"
+        yield f"{self.robot}: {sound}, {self.chunks:,} chunks, read up to block {self.block}"
+        head = self.head
+        if head is None:
+            yield "  no chunk of this robot is written"
+        else:
+            yield (
+                f"  the last one is number {head.number} of stream {head.stream[:8]}, which the robot sealed at"
+                f" {time_text(head.sealed_ms * 10**6)} by its clock"
+            )
+            if head.goodbye:
+                yield "  the robot has said goodbye: up to there, nothing is missing at the end"
+            elif self.silent:
+                ago = f"longer ago than its heartbeat of {duration_text(self.heartbeat)}"
+                yield f"  that is {ago}: it is silent, or what it wrote since is withheld"
+            else:
+                yield "  the robot has not said goodbye: more may follow"
+        told = [kind for kind in Kind if kind.label in self.counts]
+        counts = "".join(f"; {kind.label}: {kind.counted(self.counts[kind.label])}" for kind in told)
+        yield f"  {self.records:,} record{'' if self.records == 1 else 's'} proven{counts}"
+        yield from (f"  certificate {certificate}" for certificate in self.certificates)
+        yield from (f"  {finding}" for finding in self.findings)
+        if len(self.findings) >= MAX_FINDINGS:
+            yield f"  only the first {MAX_FINDINGS} findings are listed; the counts above are whole"
+        yield from (f"  {node}" for node in self.nodes)
+
+    def as_json(self) -> dict[str, Any]:
+        value = asdict(self) | {"counts": dict(self.counts)}
+        value["head"] = None if self.head is None else self.head._asdict()
+        for finding, kept in zip(value["findings"], self.findings, strict=True):
+            finding["kind"] = kept.kind.label
+            finding["violation"] = kept.kind.violation
+        return value
+
+
+def shown(text: str, limit: int = MAX_SHOWN) -> str:
+    """Foreign text for a person: one line, short, and nothing in it acts on a terminal."""
+    return printable(text if len(text) <= limit else text[: limit - 3] + "...")
+
+
+def printable(text: str) -> str:
+    r"""The text with what is not printable as JSON's `\uXXXX`; of a JSON text, the same JSON."""
+    if text.isprintable():
+        return text
+    return "".join(char if char.isprintable() else _escaped(char) for char in text)
+
+
+def _escaped(char: str) -> str:
+    units = char.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+
+
+def grouped(fingerprint: str) -> str:
+    """A fingerprint as people compare it: groups of four."""
+    return " ".join(fingerprint[at : at + 4] for at in range(0, len(fingerprint), 4))

@@ -1,0 +1,432 @@
+"""One pass over a robot's log as a chain gives it: what is proven, chunk by chunk, and what is wrong with the rest.
+
+Pure: no clock, no file, no chain. What comes in are the contract's standing of the robot, its registrations and
+its data events, oldest first, as ledger.contract has them; the node that gave them is trusted with nothing that a
+signature or the contract's count can show. Memory is bounded: 16 bytes a chunk, the certificates, the types of the
+messages, and the findings, of which so many are kept. docs/reading.md has the order of the checks and the reasons.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy
+from eth_utils.crypto import keccak
+
+from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TypeLine, parse_line
+from rosbridge_eth.chunk import (
+    Chunk,
+    Header,
+    Log,
+    Malformed,
+    NoGrant,
+    Unopenable,
+    content_key,
+    open_lines,
+    robot_id,
+)
+from rosbridge_eth.config.values import time_text
+from rosbridge_eth.errors import IdentityError, VerificationError
+from rosbridge_eth.identity import Role, Trust, split_certificates
+from rosbridge_eth.identity import verify as verify_signature
+from rosbridge_eth.reading.verdict import Bookmark, Findings, Governing, Head, Kind, Verdict, shown
+from smcrypto import CertificateError, InvalidKey, InvalidSignature, sm2, sm3, x509
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
+
+HEARTBEAT: Final = 3600.0
+CLOCK_AHEAD_MS: Final = 300_000
+"""A chunk that was sealed so much later than its block, by the clocks of robot and chain, is told."""
+CLOCK_BACK_MS: Final = 1_000
+"""What a clock may be set back between two chunks without being told: what NTP does by itself."""
+MAX_TYPES: Final = 1_000
+MAX_ELSEWHERE: Final = 16
+NO_DIGEST: Final = bytes(32)
+LAST_MOMENT: Final = 253_402_300_799
+"""The end of 9999 in seconds since 1970; what a node says is later is taken for that."""
+
+
+class Place(NamedTuple):
+    """Where a chunk stands. chunk: its index in the robot's log on the chain. block_time: seconds since 1970."""
+
+    chunk: int
+    stream: bytes
+    number: int
+    digest: bytes
+    block: int
+    block_time: int
+    transaction: bytes
+
+
+class ProvenRecord(NamedTuple):
+    """A captured message that the robot signed. number: of its line in the chunk. definition: None if none came."""
+
+    place: Place
+    number: int
+    line: bytes
+    content: MessageLine
+    definition: TypeLine | None
+
+
+@dataclass(frozen=True, slots=True)
+class ProvenChunk:
+    """A chunk that is the robot's and was opened. key: opens this one alone; with `lines` it proves single records."""
+
+    place: Place
+    chunk: Chunk
+    key: bytes = field(repr=False)
+    lines: tuple[bytes, ...] = field(repr=False)
+    records: tuple[ProvenRecord, ...] = field(repr=False)
+
+
+class _Signer(NamedTuple):
+    """A registration as far as it is to be trusted; key: None where it is not. Times are milliseconds since 1970."""
+
+    governing: Governing
+    key: sm2.PublicKey | None
+    why: str
+    begins_ms: int
+    ends_ms: int
+
+
+class Verifier:
+    """Reads one robot's log once: `read` gives what is proven, then `verdict` and `bookmark` say how it ended.
+
+    standing: of the robot, at the block up to which is read. registrations: all of them, oldest first.
+    reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
+    resume: go on behind the mark; then `read` needs the events from the one on that has the mark's last chunk.
+    now, heartbeat: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
+    may have chunks of this robot.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        ledger: bytes,
+        standing: Standing,
+        registrations: Sequence[RegistrationEvent],
+        *,
+        trust: Trust,
+        reader: sm2.PrivateKey | None,
+        block: int,
+        block_time: Callable[[int], int],
+        now: float,
+        mark: Bookmark | None = None,
+        resume: bool = False,
+        heartbeat: float = HEARTBEAT,
+        elsewhere: Sequence[bytes] = (),
+    ) -> None:
+        self.name, self.log = name, Log(ledger, robot_id(name))
+        self._standing, self._block, self._block_time = standing, block, block_time
+        self._trust, self._reader, self._mark = trust, reader, mark
+        self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
+        begin = mark if resume and mark is not None else Bookmark(0, "")
+        self.findings = Findings(begin.found)
+        self._count, self._records, self._head = begin.count, begin.records, begin.head
+        self._digest, self._last_block = begin.digest, begin.block
+        self._types = {name: _type_line(line) for name, line in begin.types.items()}
+        self._type_lines = dict(begin.types)
+        self._digests, self._indices = array("Q"), array("Q")  # of the robot's chunks: first 8 bytes, and where
+        self._broken = False
+        if self._head is not None:
+            self._remember(self._count - 1, bytes.fromhex(self._head.digest))
+        self._marked = mark is None or mark.count == 0  # whether the mark's chunk was compared
+        self._timed = -1, 0  # the latest block and its time
+        self._signers = [self._signer(event) for event in registrations]
+        self._current = -1  # the signer that governs the chunk at self._count
+        self._check_registrations(registrations)
+        if mark is not None and mark.count > standing.chunks:
+            self._roll_back(standing.chunks, f"{mark.count:,} chunks then, {standing.chunks:,} now")
+
+    # --- certificates
+
+    def _signer(self, event: RegistrationEvent) -> _Signer:
+        """Trusted if the certificates are the robot's, of the CA, and had not ended when they were registered.
+
+        They may begin later than their block's time: that is a chain whose clock is behind.
+        """
+        key, why, begins, ends, fingerprint = None, "revoked", 0, 0, ""
+        if not event.revoked:
+            fingerprint = sm3.digest(event.certificates).hex()
+            try:
+                pair = split_certificates(event.certificates)
+                fingerprint = sm3.digest(pair[0]).hex()
+                begin = max(x509.Certificate.from_der(der).not_before for der in pair)
+                at = max(begin, datetime.fromtimestamp(self._time(event.block), UTC))
+                peer = self._trust.check(*pair, role=Role.ROBOT, name=self.name, at=at)
+                key, why = peer.signing_certificate.public_key, ""
+                begins, ends = (round(moment.timestamp() * 1000) for moment in (begin, peer.not_after))
+            except (IdentityError, VerificationError, CertificateError, InvalidKey) as error:
+                why = shown(str(error))
+        new = self._mark is not None and not event.revoked and fingerprint not in self._mark.fingerprints
+        if new:
+            self.findings.add(Kind.NEW_CERTIFICATE, event.index, detail=fingerprint)
+        account = shown(event.account)
+        governing = Governing(event.index, event.block, account, fingerprint, event.revoked, key is not None, new)
+        return _Signer(governing, key, why, begins, ends)
+
+    def _check_registrations(self, events: Sequence[RegistrationEvent]) -> None:
+        """The events are linked, and the contract has the newest certificates' hash: a node cannot hide one."""
+        standing, block, index, certificates_hash, revoked = self._standing, 0, 0, NO_DIGEST, False
+        whole = True
+        for event in events:
+            whole = whole and event.previous_block == block and event.index >= index
+            block, index, revoked = event.block, event.index, event.revoked
+            certificates_hash = certificates_hash if revoked else keccak(event.certificates)
+        told = certificates_hash, revoked, block
+        if not whole or told != (standing.certificates_hash, standing.revoked, standing.changed_block):
+            detail = "a registration or revocation: the node does not show what the contract has"
+            self.findings.add(Kind.WITHHELD, standing.chunks, detail=detail)
+
+    def _governing(self, index: int) -> _Signer | None:
+        while self._current + 1 < len(self._signers) and self._signers[self._current + 1].governing.first <= index:
+            self._current += 1
+        return self._signers[self._current] if self._current >= 0 else None
+
+    def _time(self, block: int) -> int:
+        if block != self._timed[0]:
+            self._timed = block, max(0, min(self._block_time(block), LAST_MOMENT))
+        return self._timed[1]
+
+    # --- the pass
+
+    def read(self, events: Iterable[DataEvent]) -> Iterator[ProvenChunk]:
+        """What is proven, in the order of the log. events: oldest first."""
+        end, last = self._standing.chunks, b""
+        for event in events:
+            if event.first > self._count:
+                self._withhold(min(event.first, end))
+            for index, encoded in enumerate(event.chunks, event.first):
+                if index >= end:
+                    return  # came after the block that is looked at
+                if self._mark is not None and index == self._mark.count - 1:
+                    self._check_mark(index, encoded)
+                if index < self._count:
+                    continue
+                self._count, self._last_block, last = index + 1, event.block, encoded
+                proven = self._chunk(index, encoded, event)
+                if proven is not None:
+                    yield proven
+                if self._count == end and keccak(last) != self._standing.tail:
+                    self.findings.add(Kind.ALTERED, index, detail="the contract has another hash of its last chunk")
+        self._withhold(end)
+        if not self._marked and self._mark is not None and self._mark.count <= end:
+            self.findings.add(Kind.WITHHELD, self._mark.count - 1, detail="the last chunk of the reading before")
+
+    def _withhold(self, until: int) -> None:
+        if until > self._count:
+            self.findings.add(Kind.WITHHELD, self._count, until - 1, count=until - self._count)
+            self._count = until
+
+    def _roll_back(self, index: int, detail: str) -> None:
+        self.findings.add(Kind.ROLLED_BACK, index, detail=detail)
+
+    def _check_mark(self, index: int, encoded: bytes) -> None:
+        self._marked = True
+        if self._mark is not None and _identity(encoded) != self._mark.digest:
+            self._roll_back(index, "another chunk than then")
+
+    def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk | None:
+        """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
+        signer = self._governing(index)
+        try:
+            chunk = Chunk.parse(encoded)
+        except Malformed as error:
+            self._digest = sm3.digest(encoded).hex()
+            self.findings.add(Kind.MALFORMED, index, detail=shown(str(error)))
+            return None
+        header = chunk.header
+        self._digest = header.digest.hex()
+        if signer is None or signer.key is None:
+            why = "no certificate is registered" if signer is None else signer.why
+            self.findings.add(Kind.UNTRUSTED, index, detail=why)
+            return None
+        if not is_signed(self.log, signer.key, chunk):
+            elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
+            self.findings.add(Kind.ELSEWHERE if elsewhere else Kind.FORGED, index)
+            return None
+        if header.sealed_ms > signer.ends_ms:
+            why = f"sealed after the certificate's end, {time_text(signer.ends_ms * 10**6)}"
+            self.findings.add(Kind.UNTRUSTED, index, detail=why)
+            return None
+        if not self._follow(index, header):
+            return None
+        self._check_clock(index, header, signer, event.block)
+        self._head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
+        if chunk.body and sm3.digest(chunk.body) != header.body_digest:
+            self.findings.add(Kind.ALTERED, index, detail="the body is not the one that the header names")
+            return None
+        if chunk.dropped:
+            self.findings.add(Kind.DROPPED, index, count=header.records)
+            return None
+        time = self._time(event.block)
+        place = Place(index, header.stream, header.number, header.digest, event.block, time, event.transaction)
+        return self._open(place, chunk)
+
+    # --- links
+
+    def _remember(self, index: int, digest: bytes) -> None:
+        self._digests.append(int.from_bytes(digest[:8], "big"))
+        self._indices.append(index)
+
+    def _index_of(self, digest: bytes) -> int | None:
+        """Where a header of this digest was read."""
+        if not self._digests:
+            return None
+        found = numpy.flatnonzero(numpy.frombuffer(self._digests, numpy.uint64) == int.from_bytes(digest[:8], "big"))
+        return self._indices[int(found[0])] if len(found) else None
+
+    def _follow(self, index: int, header: Header) -> bool:
+        """Tell where the chunk does not follow the newest one; False for one that was read already."""
+        head = self._head
+        follows = header.previous == (NO_DIGEST if head is None else bytes.fromhex(head.digest))
+        same_stream = head is not None and header.stream.hex() == head.stream
+        ahead = header.number - (head.number + 1 if head is not None and same_stream else 0)
+        knows_none = not same_stream and header.number == 0 and header.previous == NO_DIGEST
+        breaks = ahead != 0 or not (follows or knows_none)
+        self._broken = self._broken or breaks
+        # In an unbroken log nothing can be there twice; after a break, what follows may have been read before it.
+        known = self._index_of(header.digest) if self._broken else None
+        if known is not None:
+            self.findings.add(Kind.FORKED, index, detail=f"the chunk of index {known} once more")
+            return False
+        if breaks:
+            self._tell_break(index, header, ahead, same_stream)
+        if head is not None and not same_stream and (knows_none or not head.goodbye):
+            detail = "it knows of nothing before: what it held is lost" if knows_none else ""
+            self.findings.add(Kind.RESTARTED, index, detail=detail)
+        self._remember(index, header.digest)
+        return True
+
+    def _tell_break(self, index: int, header: Header, ahead: int, same_stream: bool) -> None:
+        """Forked where the robot wrote something else at this place or after what it follows; else missing."""
+        where = f"number {header.number} of stream {header.stream.hex()[:8]}"
+        followed = None if header.previous == NO_DIGEST else self._index_of(header.previous)
+        if followed is not None:
+            self.findings.add(Kind.FORKED, index, detail=f"{where} follows the chunk of index {followed}")
+        elif same_stream and ahead <= 0:
+            self.findings.add(Kind.FORKED, index, detail=f"{where}, where another one is")
+        elif ahead > 0:
+            self.findings.add(Kind.MISSING, index, count=ahead, detail=f"before {where}")
+        else:
+            self.findings.add(Kind.MISSING, index, detail=f"what {where} follows; it may be more than one")
+
+    def _check_clock(self, index: int, header: Header, signer: _Signer, block: int) -> None:
+        sealed = header.sealed_ms
+        if sealed > self._time(block) * 1000 + CLOCK_AHEAD_MS:
+            self.findings.add(Kind.CLOCK, index, detail="sealed later than its block was made")
+        if sealed < signer.begins_ms:
+            self.findings.add(Kind.CLOCK, index, detail="sealed before the robot's certificate began")
+        if self._head is not None and sealed < self._head.sealed_ms - CLOCK_BACK_MS:
+            self.findings.add(Kind.CLOCK, index, detail="sealed before the chunk that it follows")
+
+    # --- content
+
+    def _open(self, place: Place, chunk: Chunk) -> ProvenChunk | None:
+        if not chunk.header.records:
+            return ProvenChunk(place, chunk, b"", (), ())
+        try:
+            if self._reader is None:
+                raise NoGrant("there is no reader's key")
+            key = content_key(chunk.header, self._reader)
+            lines = open_lines(self.log, chunk, key)
+        except NoGrant:
+            self.findings.add(Kind.NO_GRANT, place.chunk, count=chunk.header.records)
+            return None
+        except Unopenable as error:
+            self.findings.add(Kind.UNOPENABLE, place.chunk, detail=shown(str(error)))
+            return None
+        records = tuple(self._parsed(place, lines))
+        self._records += len(records)
+        return ProvenChunk(place, chunk, key, lines, records)
+
+    def _parsed(self, place: Place, lines: Sequence[bytes]) -> Iterator[ProvenRecord]:
+        unsynchronised = 0
+        for number, line in enumerate(lines):
+            try:
+                content = parse_line(line)
+            except VerificationError as error:
+                self.findings.add(Kind.UNOPENABLE, place.chunk, detail=f"line {number}: {shown(str(error))}")
+                continue
+            match content:
+                case MessageLine():
+                    unsynchronised += not content.clock
+                    yield ProvenRecord(place, number, line, content, self._types.get(content.type_name))
+                case TypeLine():
+                    if len(self._types) < MAX_TYPES or content.type_name in self._types:
+                        self._types[content.type_name] = content
+                        self._type_lines[content.type_name] = line.decode()
+                case LostLine():
+                    detail = f"{shown(content.topic)}: {shown(content.why)}"
+                    self.findings.add(Kind.LOST, place.chunk, count=content.lost, detail=detail)
+                case StreamLine():
+                    pass
+        if unsynchronised:
+            detail = "messages captured while it was not synchronised"
+            self.findings.add(Kind.CLOCK, place.chunk, count=unsynchronised, detail=detail)
+
+    # --- how it ended
+
+    def verdict(self, nodes: Sequence[str] = ()) -> Verdict:
+        head = self._head
+        silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > self._heartbeat
+        return Verdict(
+            robot=self.name,
+            sound=self.findings.sound,
+            chunks=self._standing.chunks,
+            block=self._block,
+            head=head,
+            records=self._records,
+            counts=dict(self.findings.counts),
+            certificates=tuple(signer.governing for signer in self._signers),
+            silent=silent,
+            heartbeat=self._heartbeat,
+            findings=tuple(self.findings.kept),
+            nodes=tuple(nodes),
+        )
+
+    def bookmark(self, *, confirm: bool = False) -> Bookmark | None:
+        """What to keep after `read` has ended; the old mark where the node kept something back or rolled back.
+
+        confirm: the reader has compared the fingerprints; new certificates are known from now on.
+        """
+        counts = self.findings.counts
+        if counts[Kind.WITHHELD.label] or counts[Kind.ROLLED_BACK.label]:
+            return self._mark
+        now = [signer.governing.fingerprint for signer in self._signers if signer.governing.fingerprint]
+        known = now if confirm or self._mark is None else self._mark.fingerprints
+        found = {label: count for label, count in counts.items() if label != Kind.NEW_CERTIFICATE.label}
+        return Bookmark(
+            self._count, self._digest, self._last_block, tuple(dict.fromkeys(known)), self._head, self._records, found,
+            dict(self._type_lines),
+        )  # fmt: skip
+
+
+def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
+    """Whether the robot signed this header, for this form of the chunk; the body is looked at afterwards."""
+    purpose = "dropped" if chunk.dropped else "chunk"
+    try:
+        verify_signature(key, purpose, log.ledger + log.tk + chunk.header.encoded, chunk.signature)
+    except InvalidSignature:
+        return False
+    return True
+
+
+def _identity(encoded: bytes) -> str:
+    """The digest of a chunk's header; of what is no chunk, of all its bytes."""
+    try:
+        return Chunk.parse(encoded).header.digest.hex()
+    except Malformed:
+        return sm3.digest(encoded).hex()
+
+
+def _type_line(line: str) -> TypeLine:
+    content = parse_line(line.encode())
+    if not isinstance(content, TypeLine):
+        raise VerificationError("a bookmark has a definition that is none")
+    return content
