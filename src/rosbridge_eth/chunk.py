@@ -38,7 +38,7 @@ VERSION: Final = 2
 #: The only flag: the last chunk of an orderly run.
 GOODBYE: Final = 1
 
-MAX_BODY: Final = 64 * 1024
+MAX_BODY: Final = 64 * 1024 - 48  # the longest below 64 KiB: 1,023 blocks of 64 and the tag
 MAX_READERS: Final = 16
 MAX_RECORDS: Final = 1000
 #: Bytes of JSON Lines that a reader unpacks at most.
@@ -173,7 +173,7 @@ class Header:
 
 
 def _is_body(length: int) -> bool:
-    return 0 < length - _GCM_TAG <= MAX_BODY - _GCM_TAG and (length - _GCM_TAG) % _BLOCK == 0
+    return _GCM_TAG < length <= MAX_BODY and length % _BLOCK == _GCM_TAG
 
 
 #: Digest of the empty body, and root of the tree without leaves (RFC 9162, 2.1.1).
@@ -274,7 +274,7 @@ def _pack(lines: Sequence[bytes], compress: bool, level: int) -> bytes:
     if len(lines) > MAX_RECORDS or len(content) > MAX_PLAINTEXT:
         raise TooLarge(f"{len(lines)} lines of {len(content)} bytes are too many for a chunk")
     frame = _compressed(content, level) if compress else _stored(content)
-    if len(frame) > (MAX_BODY - _GCM_TAG) // _BLOCK * _BLOCK:
+    if len(frame) > MAX_BODY - _GCM_TAG:
         raise TooLarge(f"{len(lines)} lines take {len(frame)} bytes, more than fit a chunk")
     return frame + bytes(-len(frame) % _BLOCK)
 

@@ -112,10 +112,9 @@ def test_the_longest_line_fits_whatever_it_holds_and_the_longest_chunk_is_no_lon
     noise = repeating()(MAX_LINE).replace(b"\n", b" ")
     for compress in (True, False):
         assert opened(sealed([noise], compress=compress)) == (noise,)
-    noise += repeating(2)(4000).replace(b"\n", b" ")
+    noise += repeating(2)(MAX_BODY - 16 - 12 - 1 - MAX_LINE).replace(b"\n", b" ")
     full = sealed([noise], compress=False, readers=[sm2.PrivateKey.from_int(9 + i).public_key for i in range(16)])
-    assert MAX_CHUNK - 64 < len(full.encoded) <= MAX_CHUNK
-    assert len(full.body) <= MAX_BODY
+    assert len(full.body) == MAX_BODY and len(full.encoded) == MAX_CHUNK
     assert Chunk.parse(full.encoded) == full
 
 
@@ -227,7 +226,7 @@ def test_a_body_of_another_chunk_is_altered():
         {"version": 1}, {"version": 3}, {"flags": 2}, {"flags": 0x81}, {"n": 0}, {"n": 2}, {"n": 17},
         {"records": 0}, {"records": MAX_RECORDS + 1}, {"records": 2**32 - 1}, {"sealed_ms": chunks.MAX_TIME_MS},
         {"body_length": 0}, {"body_length": 16}, {"body_length": 64}, {"body_length": 81},
-        {"body_length": MAX_BODY + 16}, {"body_length": 2**32 - 1},
+        {"body_length": MAX_BODY + 16}, {"body_length": MAX_BODY + 64}, {"body_length": 2**32 - 1},
     ],
     ids=str,
 )  # fmt: skip
