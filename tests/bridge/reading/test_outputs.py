@@ -1,0 +1,337 @@
+"""Files made of proven records: read back by rosbags, csv, json and an image reader, not by what wrote them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from matplotlib.image import imread
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from rosbridge_eth.capture import MessageLine, TypeLine, Wire, decoder_for_known, definition_line, parse_line
+from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.reading import outputs
+from rosbridge_eth.reading.outputs import BagSummary, Choice
+from rosbridge_eth.reading.verify import Place, ProvenRecord
+
+T0 = 1_763_690_000_000_000_000
+PLACE = Place(7, b"s" * 16, 3, b"d" * 32, 9, T0 // 10**9 + 7, b"\xab" * 32)
+BAGS = ["out.bag", "out", "out.mcap", "out.db3"]
+EVIL = "/\x1b[2J\u202e"
+
+
+def known(type_name: str, wire: Wire = Wire.CDR) -> TypeLine:
+    decoder = decoder_for_known(wire, type_name)
+    assert decoder is not None
+    found = parse_line(definition_line(decoder))
+    assert isinstance(found, TypeLine)
+    return found
+
+
+def record(
+    n: int, type_name: str, data: dict[str, Any], topic: str = "/t", definition: TypeLine | None = None
+) -> ProvenRecord:
+    line = json.dumps(
+        {"topic": topic, "type": type_name, "source": "bag", "received_ns": T0 + n, "captured_ns": T0 + n + 5,
+         "clock": True, "data": data},
+        separators=(",", ":"), ensure_ascii=False,
+    ).encode()  # fmt: skip
+    content = parse_line(line)
+    assert isinstance(content, MessageLine)
+    return ProvenRecord(PLACE, n, line, content, definition)
+
+
+def point(n: int, x: float = 0.5, y: float = -1.5, topic: str = "/t", **more: Any) -> ProvenRecord:
+    data = {"x": x, "y": y, "z": 0.0} | more
+    return record(n, "geometry_msgs/msg/Point", data, topic, known("geometry_msgs/msg/Point"))
+
+
+def odometry(n: int, x: float, y: float) -> ProvenRecord:
+    data = {"pose": {"pose": {"position": {"x": x, "y": y, "z": 0.0}}}}
+    return record(n, "nav_msgs/msg/Odometry", data, "/odom", known("nav_msgs/msg/Odometry"))
+
+
+def write_bag(path: Path, records: Iterable[ProvenRecord]) -> BagSummary:
+    with outputs.bag(path) as bag:
+        for one in records:
+            bag.write(one)
+    return bag.summary
+
+
+def messages(path: Path) -> list[tuple[str, str, int, Any]]:
+    store = get_typestore(Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.LATEST)
+    with AnyReader([path], default_typestore=store) as reader:
+        return [
+            (connection.topic, connection.msgtype, time, reader.deserialize(raw, connection.msgtype))
+            for connection, time, raw in reader.messages()
+        ]
+
+
+# --- choosing
+
+
+def test_records_are_chosen_by_topic_and_time_as_they_come():
+    records = [point(n, topic="ab"[n % 2]) for n in range(6)]
+
+    def chosen(**wanted: Any) -> list[int]:
+        return [one.number for one in Choice(**wanted).choose(iter(records))]
+
+    assert chosen() == [0, 1, 2, 3, 4, 5]
+    assert chosen(topic="b") == [1, 3, 5]
+    assert chosen(from_ns=T0 + 2, to_ns=T0 + 4) == [2, 3]
+    assert chosen(at_ns=T0 + 4) == [4, 3]
+    assert next(Choice().choose(point(n) for n in iter(int, 1))).number == 0, "nothing is read ahead"
+
+
+# --- JSON lines
+
+
+def test_a_json_line_is_the_record_and_where_it_is_proven():
+    text = outputs.json_line(point(3))
+    value = json.loads(text)
+    assert text.endswith("}\n")
+    assert text.count("\n") == 1
+    assert (value["topic"], value["data"], value["received_ns"]) == ("/t", {"x": 0.5, "y": -1.5, "z": 0.0}, T0 + 3)
+    assert value["proof"] == {
+        "chunk": 7, "record": 3, "stream": "73" * 16, "number": 3, "digest": "64" * 32, "block": 9,
+        "block_time": "2025-11-21T01:53:27.000Z", "transaction": "0x" + "ab" * 32,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["\x7f\x9b31m", "\u202e", "\u2028", "\U000e0041", "é漢", '\\"\n'])
+def test_a_json_line_keeps_its_text_and_shows_nothing_that_acts_on_a_terminal(text):
+    line = outputs.json_line(record(1, "pkg/msg/Type", {text: text}, "/" + text))
+    assert line[:-1].isprintable()
+    assert json.loads(line)["data"] == {text: text}
+
+
+# --- tables
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_table_has_a_column_for_each_field_of_any_record(tmp_path):
+    with outputs.table(tmp_path / "t.csv") as table:
+        for one in (point(1), odometry(2, 3.0, 4.0), record(3, "pkg/msg/A", {"ranges": [1, 2.5, "NaN"], "on": True})):
+            table.write(one)
+    rows = read_table(tmp_path / "t.csv")
+    assert [row["topic"] for row in rows] == ["/t", "/odom", "/t"]
+    assert [row["x"] for row in rows] == ["0.5", "", ""]
+    assert [row["pose.pose.position.y"] for row in rows] == ["", "4.0", ""]
+    assert (rows[2]["ranges"], rows[2]["on"], rows[2]["received_ns"]) == ('[1, 2.5, "NaN"]', "True", str(T0 + 3))
+    assert (rows[0]["chunk"], rows[0]["record"], rows[0]["block"]) == ("7", "1", "9")
+
+
+def test_no_cell_is_taken_for_a_formula_or_acts_on_a_terminal(tmp_path):
+    hostile = {"=cmd|' /C calc'!A0": "=1+1", "@x": "+1", "s": EVIL, "n": -3}
+    with outputs.table(tmp_path / "t.csv") as table:
+        table.write(record(1, "pkg/msg/A", hostile, "-topic"))
+    [row] = read_table(tmp_path / "t.csv")
+    assert not any(cell.startswith(("=", "@", "+")) for cell in [*row, *row.values()])
+    assert (row["topic"], row["n"]) == ("'-topic", "-3")
+    assert all(text.isprintable() for text in (tmp_path / "t.csv").read_text("utf-8").splitlines())
+
+
+def test_columns_are_bounded(tmp_path):
+    with outputs.table(tmp_path / "t.csv") as table:
+        for n in range(12):
+            table.write(record(n, "pkg/msg/A", {f"f{n}_{m}": m for m in range(500)}))
+    assert len(read_table(tmp_path / "t.csv")[0]) == outputs.MAX_COLUMNS + 10
+
+
+# --- bags
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_whole_records_become_their_own_messages(tmp_path, name):
+    summary = write_bag(tmp_path / name, [point(2, x=2.0), point(1, x=1.0)])
+    assert (summary.whole, summary.partial, summary.as_json, summary.notes) == (2, 0, 0, [])
+    read = messages(tmp_path / name)
+    assert sorted((topic, kind, time) for topic, kind, time, _ in read) == [
+        ("/t", "geometry_msgs/msg/Point", T0 + 1), ("/t", "geometry_msgs/msg/Point", T0 + 2)]  # fmt: skip
+    assert sorted(m.x for *_, m in read) == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_partial_records_are_on_a_topic_that_says_so(tmp_path, name):
+    summary = write_bag(tmp_path / name, [odometry(1, 3.0, 4.0), odometry(2, 5.0, 6.0)])
+    assert (summary.whole, summary.partial) == (0, 2)
+    read = messages(tmp_path / name)
+    assert {(topic, kind) for topic, kind, *_ in read} == {
+        ("/odom/partial", "nav_msgs/msg/Odometry"), (outputs.NOTES, "std_msgs/msg/String")}  # fmt: skip
+    assert [m.pose.pose.position.x for topic, *_, m in read if topic != outputs.NOTES] == [3.0, 5.0]
+    (note,) = (m.data for topic, *_, m in read if topic == outputs.NOTES)
+    assert "pose.covariance" in note
+    assert "twist" in note
+
+
+CUSTOM = TypeLine("acme_msgs/msg/Arm", "ros1", "msg", "Header header\nfloat64[2] joints\nstring name\n" + "=" * 80 +
+                  "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n")  # fmt: skip
+ARM = {"header": {"seq": 5, "stamp": T0, "frame_id": "base"}, "joints": [1.5, 2.5], "name": "left"}
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_a_type_of_ones_own_comes_back_whole_in_every_kind_of_bag(tmp_path, name):
+    """From ROS 1: in ROS 2's bags the header has no seq."""
+    summary = write_bag(tmp_path / name, [record(1, "acme_msgs/msg/Arm", ARM, "/arm", CUSTOM)])
+    assert (summary.whole, summary.notes) == (1, [])
+    [(topic, kind, time, arm)] = messages(tmp_path / name)
+    assert (topic, kind, time) == ("/arm", "acme_msgs/msg/Arm", T0 + 1)
+    assert (arm.joints.tolist(), arm.name, arm.header.frame_id) == ([1.5, 2.5], "left", "base")
+    assert (arm.header.stamp.sec, arm.header.stamp.nanosec) == divmod(T0, 10**9)
+    assert hasattr(arm.header, "seq") == (name == "out.bag")
+
+
+def test_a_ros_2_record_becomes_a_ros_1_message(tmp_path):
+    data = {"header": {"stamp": T0, "frame_id": "map"}, "point": {"x": 1.0, "y": 2.0, "z": 3.0}}
+    one = record(1, "geometry_msgs/msg/PointStamped", data, "/p", known("geometry_msgs/msg/PointStamped"))
+    assert write_bag(tmp_path / "out.bag", [one]).whole == 1
+    [(*_, message)] = messages(tmp_path / "out.bag")
+    assert (message.header.seq, message.header.frame_id, message.point.z) == (0, "map", 3.0)
+
+
+def test_two_definitions_of_one_name_stay_apart(tmp_path):
+    first, second = (TypeLine("a_msgs/msg/A", "ros1", "msg", f"int32 {name}\n") for name in "xy")
+    records = [record(1, "a_msgs/msg/A", {"x": 1}, "/a", first), record(2, "a_msgs/msg/A", {"y": 2}, "/a", second)]
+    assert write_bag(tmp_path / "out.bag", records).whole == 2
+
+
+@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize(
+    "one",
+    [
+        record(1, "acme_msgs/msg/Arm", {"joint": 1}),
+        record(1, "no type at all", {"joint": 1}),
+        point(1, unheard_of=2),
+        record(1, "a_msgs/msg/A", {"x": 1}, definition=TypeLine("a_msgs/msg/A", "ros1", "msg", "evil[][ x")),
+        record(1, "a_msgs/msg/A", {"x": 1}, definition=TypeLine("a_msgs/msg/A", "ros3", "msg", "int32 x")),
+        record(1, "a_msgs/msg/A", {"x": 2**40}, definition=TypeLine("a_msgs/msg/A", "ros1", "msg", "int32 x")),
+    ],
+)
+def test_what_cannot_be_a_message_is_json(tmp_path, name, one):
+    summary = write_bag(tmp_path / name, [one])
+    assert (summary.as_json, len(summary.notes)) == (1, 1)
+    (topic, kind, time, message), _ = sorted(messages(tmp_path / name), key=lambda m: m[0] == outputs.NOTES)
+    assert (topic, kind, time) == ("/t/json", "std_msgs/msg/String", T0 + 1)
+    assert message.data.encode() == one.line
+
+
+@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize("received_ns", [0, 2**63 - 1])
+def test_times_that_no_bag_can_have_are_brought_into_its_range(tmp_path, name, received_ns):
+    one = point(1)
+    one = one._replace(content=replace(one.content, received_ns=received_ns))
+    assert write_bag(tmp_path / name, [one]).whole == 1
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_topics_are_escaped(tmp_path, name):
+    write_bag(tmp_path / name, [point(1, topic=EVIL)])
+    assert all(topic.isprintable() for topic, *_ in messages(tmp_path / name))
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_a_bag_that_is_there_is_not_overwritten(tmp_path, name):
+    (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="there already"):
+        write_bag(tmp_path / name, [point(1)])
+    assert (tmp_path / name).read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("name", [*BAGS, "out.csv"])
+def test_what_fails_half_way_leaves_nothing_under_the_name(tmp_path, name):
+    def failing() -> Iterable[ProvenRecord]:
+        yield point(1)
+        raise OSError("the node went away")
+
+    make: Any = outputs.table if name == "out.csv" else outputs.bag
+    with pytest.raises(OSError, match="went away"), make(tmp_path / name) as output:
+        for one in failing():
+            output.write(one)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_a_bag_of_nothing(tmp_path, name):
+    assert write_bag(tmp_path / name, []).whole == 0
+    assert (tmp_path / name).exists()
+
+
+# --- pictures
+
+
+def drawn(path: Path, records: Iterable[ProvenRecord]) -> int:
+    trajectory = outputs.Trajectory()
+    for one in records:
+        trajectory.write(one)
+    return trajectory.draw(path)
+
+
+def test_positions_are_found_in_the_usual_messages():
+    trajectory = outputs.Trajectory()
+    for one in (
+        odometry(1, 1.0, 2.0),
+        record(2, "geometry_msgs/msg/PoseStamped", {"pose": {"position": {"x": 3, "y": 4.0}}}, "/pose"),
+        point(3, 5.0, 6.0),
+        record(4, "geometry_msgs/msg/Point", {"x": "NaN", "y": 6.0}),
+        record(5, "geometry_msgs/msg/Point", {"x": 1e300, "y": 6.0}),
+        record(6, "geometry_msgs/msg/Point", {"x": True, "y": 6.0}),
+        record(7, "std_msgs/msg/String", {"data": "x"}, "/text"),
+    ):
+        trajectory.write(one)
+    assert trajectory.tracks == {
+        "/odom": [(T0 + 1, 1.0, 2.0)], "/pose": [(T0 + 2, 3.0, 4.0)], "/t": [(T0 + 3, 5.0, 6.0)]}  # fmt: skip
+
+
+def test_the_picture_shows_the_track_where_it_was(tmp_path):
+    """A track along the left and lower edge leaves ink there and none in the middle of the upper right."""
+    corner = [odometry(n, 0.0, 10.0 - n) for n in range(11)] + [odometry(11 + n, float(n), 0.0) for n in range(11)]
+    assert drawn(tmp_path / "track.png", corner) == 22
+    image = imread(tmp_path / "track.png")[:, :, :3]
+    coloured = (image.max(axis=2) - image.min(axis=2)) > 0.3
+    height, width = coloured.shape
+    assert coloured[: height // 2, : width // 3].any()
+    assert coloured[height * 2 // 3 :, width // 2 :].any()
+    assert not coloured[height // 4 : height // 2, width // 2 : width * 3 // 4].any()
+
+
+@pytest.mark.parametrize("topic", [r"$\frac{$", "$x$", "_hidden", EVIL, "/" + "x" * 50_000, "%s", "\\"])
+def test_a_topic_is_drawn_as_it_is_written(tmp_path, topic):
+    assert drawn(tmp_path / "track.svg", [point(1, topic=topic), point(2, topic=topic)]) == 2
+
+
+def test_topics_in_a_picture_are_bounded(tmp_path):
+    assert drawn(tmp_path / "track.png", [point(n, topic=f"/t{n}") for n in range(100)]) == outputs.MAX_TRACKS
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf"])
+def test_without_positions_the_picture_says_so(tmp_path, name):
+    assert drawn(tmp_path / name, []) == 0
+    assert (tmp_path / name).stat().st_size > 500
+
+
+@pytest.mark.parametrize("name", ["a.doc", "a"])
+def test_an_ending_that_is_no_picture(tmp_path, name):
+    with pytest.raises(ConfigError, match=r"\.png, \.svg or \.pdf"):
+        outputs.check_picture(tmp_path / name)
+
+
+@pytest.mark.parametrize(("check", "name"), [(outputs.check_bag, "a.doc"), (outputs.check_table, "a.doc")])
+def test_an_ending_that_is_no_bag_or_table(tmp_path, check, name):
+    with pytest.raises(ConfigError, match="doc"):
+        check(tmp_path / name)
+
+
+@pytest.mark.parametrize(("check", "name"), [(outputs.check_bag, "b/a.bag"), (outputs.check_table, "b/a.csv")])
+def test_a_folder_that_is_not_there(tmp_path, check, name):
+    with pytest.raises(ConfigError, match="no folder"):
+        check(tmp_path / name)
