@@ -83,7 +83,7 @@ Name: TypeAlias = Annotated[str, _matching(
 MasterUri: TypeAlias = Annotated[str, _matching(
     rf"http://{_HOST}(?::\d{{1,5}})?/?", 'write the master\'s URI, such as "http://192.0.2.7:11311"')]
 Host: TypeAlias = Annotated[str, _matching(
-    r"[A-Za-z0-9_.\-]+|[0-9A-Fa-f:.]+", "write a name or an address, without a port")]
+    r"[A-Za-z0-9_.\-]+|[0-9A-Fa-f]*:[0-9A-Fa-f]*:[0-9A-Fa-f:.]*", "write a name or an address, without a port")]
 Ros1Node: TypeAlias = Annotated[str, _matching(
     rf"/?{_PART}(?:/{_PART})*", 'a node\'s name has letters, digits, _ and /, such as "/robot_1/recorder"')]
 Ros2Node: TypeAlias = Annotated[str, _matching(
@@ -221,7 +221,7 @@ class Ros1Config(Section):
         """For sources.open_source."""
         from rosbridge_eth.sources.ros1 import Ros1Settings
 
-        return Ros1Settings(self.master, self.hostname, self.node, self.max_message)
+        return Ros1Settings(master=self.master, hostname=self.hostname, node=self.node, max_message=self.max_message)
 
 
 class Ros2Config(Section):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from pydantic import BaseModel
 
 from rosbridge_eth import config as config_package
 from rosbridge_eth.capture import TopicRule
+from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.config import (
     ReaderConfig,
     RobotConfig,
@@ -19,11 +19,9 @@ from rosbridge_eth.config import (
     load_robot_config,
     load_server_config,
     parse_config,
-    require_file,
-    require_private,
 )
 from rosbridge_eth.config.models import SOURCE_KINDS
-from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.sources import BagSettings, SimSettings
 
 S = 10**9
@@ -40,7 +38,7 @@ def server(text: str) -> ServerConfig:
 
 def test_one_line_is_a_whole_configuration():
     config = robot('topics = ["/robot_1/odom"]')
-    assert config.rules() == [TopicRule("/robot_1/odom")]
+    assert config.rules() == [TopicRule("/robot_1/odom", limit=16 * 1024)]
     assert config.source is None
     assert config.channel == "exchange"
 
@@ -48,7 +46,6 @@ def test_one_line_is_a_whole_configuration():
 @pytest.mark.parametrize(
     ("environment", "kind", "reason"),
     [
-        ({}, "sim", "nothing real is recorded"),
         ({"ROS_VERSION": "1"}, "ros1", "ROS_VERSION is 1"),
         ({"ROS_VERSION": "2", "ROS_MASTER_URI": "http://robot:11311"}, "ros2", "ROS_VERSION is 2"),
         ({"ROS_MASTER_URI": "http://robot:11311"}, "ros1", "ROS_MASTER_URI is http://robot:11311"),
@@ -60,6 +57,11 @@ def test_without_a_source_the_environment_says_which(environment, kind, reason):
     source, why = robot('topics = ["/robot_1/odom"]').source_and_why(environment)
     assert source.settings().kind == kind
     assert reason in why
+
+
+def test_without_a_source_and_without_ros_nothing_is_invented():
+    with pytest.raises(ConfigError, match=r'no \[source\] .* write \[source\] with kind = .* "sim"'):
+        robot('topics = ["/robot_1/odom"]').source_and_why({"PATH": "/bin"})
 
 
 def test_a_source_that_is_configured_is_not_overruled_by_the_environment():
@@ -74,25 +76,25 @@ def test_topics_are_names_or_tables():
 nodes = ["/robot_1/base"]
 topics = [
     "robot_1/imu",
-    { topic = "/robot_1/odom", fields = ["pose.pose.position"], rate = 2, delivery = "latest", oversize = "refuse" },
+    { topic = "/robot_1/odom", fields = ["pose.pose.position"], rate = 2 },
     { topic = "/a", from = 1970-01-01T00:00:01Z, until = "1970-01-01T00:00:02Z" },
     { topic = "/b", for = "2s", once = true },
     { topic = "/c/*", at = 1970-01-01T00:00:03Z },
 ]
 [capture]
-delivery = "reliable"
+oversize = "refuse"
 field_limit = "2 KiB"
 """
     )
     rules = {rule.topic: rule for rule in config.rules()}
     assert list(rules) == ["/robot_1/imu", "/robot_1/odom", "/a", "/b", "/c/*", "**"]
-    assert all(rule.limit == 2048 for rule in rules.values())
+    assert all((rule.limit, rule.oversize) == (2048, "refuse") for rule in rules.values())
     odom = rules["/robot_1/odom"]
-    assert (odom.fields, odom.rate, odom.delivery, odom.oversize) == (("pose.pose.position",), 2, "latest", "refuse")
+    assert (odom.fields, odom.rate) == (("pose.pose.position",), 2)
     assert (rules["/a"].from_ns, rules["/a"].until_ns) == (S, 2 * S)
     assert (rules["/b"].for_ns, rules["/b"].once) == (2 * S, True)
     assert rules["/c/*"].at_ns == 3 * S
-    assert rules["**"].delivery == "reliable", "what a node publishes, by the defaults"
+    assert rules["**"].fields == (), "what a node publishes, whole"
 
 
 def test_a_bag_stands_relative_to_the_file():
@@ -108,7 +110,7 @@ MISTAKES = {
     # The line, the key, what was given, what is allowed, and the nearest right word.
     'topcs = ["/a"]': "line 1: unknown key 'topcs'; did you mean 'topics'?",
     'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "line 4: unknown key 'max_sise' in spool; did you mean 'max_size'?",
-    'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: acknowledge, capture, channel, monitor, ",
+    'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: capture, channel, log, monitor, nodes, ",
     'topics = [{topic = "/a", rat = 1}]': "line 1: unknown key 'rat' in topics[0]; did you mean 'rate'?",
     'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
@@ -125,9 +127,22 @@ MISTAKES = {
     'topics = [{topic = "/a", once = 1}]': "topics[0].once is 1; it should be true or false",
     'topics = [{topic = "/a", fields = ["x..y"]}]': "topics[0].fields[0]: 'x..y' is not a field path, such as",
     'topics = [{topic = "/a", fields = ["x[*]", "x[0]"]}]': "one array is selected by [*] and by an index",
-    'topics = [{topic = "/a", delivery = "relible"}]': (
-        "topics[0].delivery is 'relible'; allowed: 'reliable', 'latest'; did you mean 'reliable'?"
+    'topics = [{topic = "/a", delivery = "latest"}]': (
+        "line 1: unknown key 'delivery' in topics[0]; it is gone since the second edition: every record is kept"
     ),
+    'topics = ["/a"]\nacknowledge = "stored"': "unknown key 'acknowledge'; it is gone since the second edition: every",
+    'topics = ["/a"]\n[stream]\nage = "1h"': "line 2: unknown key 'stream'; it is gone since the second edition: a new",
+    'topics = ["/a"]\n[spool]\ncommit = "1s"': "line 3: unknown key 'commit' in spool; it is gone since the second",
+    'topics = ["/a"]\n[log]\nperiod = "2h"': "line 3: log.period is '2h'; it should be at most '1h'",
+    'topics = ["/a"]\n[log]\nperiod = "49ms"': "line 3: log.period is '49ms'; it should be at least '50ms'",
+    'topics = ["/a"]\n[log]\nperiod = 1': "line 3: log.period is 1; write a duration with its unit, such as",
+    'topics = ["/a"]\n[log]\ncompress = "no"': "line 3: log.compress is 'no'; it should be true or false",
+    'topics = ["/a"]\n[capture]\nfield_limit = "1 MiB"': "field_limit is '1 MiB'; it should be at most '48 KiB'",
+    'topics = ["/a"]\n[capture]\noversize = "digst"': (
+        "capture.oversize is 'digst'; allowed: 'digest', 'refuse'; did you mean 'digest'?"
+    ),
+    'topics = ["/a"]\n[source]\nkind = "ros1"\nmaster = "robot:11311"': "source.master is 'robot:11311'; write the",
+    'topics = ["/a"]\n[source]\nkind = "ros1"\nhostname = "a:1"': "source.hostname is 'a:1'; write a name or an",
     'topics = [{topic = "/a", at = 2026-01-01T00:00:00Z, rate = 1, for = "2s"}]': (
         "topics[0] has both `at` and for, rate; a moment is one message, choose one"
     ),
@@ -151,11 +166,10 @@ MISTAKES = {
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nstart = "5s"\nstop = "2s"': "source ends before it begins",
     'topics = ["/a"]\n[source]\nkind = "sim"\nrobot = "a/b"': "source.robot is 'a/b'; it becomes part of a topic's",
     'topics = ["/a"]\n[spool]\nmax_size = "64 mib"': "line 3: spool.max_size is '64 mib'; write a size such as",
-    'topics = ["/a"]\n[spool]\nmax_records = 1.5': "line 3: spool.max_records is 1.5; it should be a whole number",
-    'topics = ["/a"]\n[spool]\nmax_records = 1': "line 3: spool.max_records is 1; it should be at least 16",
+    'topics = ["/a"]\n[source]\nkind = "ros2"\ndepth = 1.5': "line 4: source.depth is 1.5; it should be a whole number",
+    'topics = ["/a"]\n[spool]\nmax_size = 5': "line 3: spool.max_size is 5; it should be at least '1 MiB'",
     'topics = ["/a"]\nchannel = "transprot"': "allowed: 'exchange', 'transport'; did you mean 'transport'?",
     'topics = ["/a"]\nserver = "host"': "line 2: server is 'host'; write HOST:PORT",
-    'topics = ["/a"]\nname = "Robot 1"': "line 2: name is 'Robot 1'; a name has 1 to 63 of a-z",
     'topics = ["/a"]\nreaders = []': "it has no reader: nobody could open the records",
     "topics = [": "is not TOML: ",
     "topics = 1\ntopics = 2": "is not TOML: cannot overwrite a value",
@@ -180,12 +194,18 @@ def test_a_mistake_in_robot_toml_is_told(text):
         ('channel = ["foo"]', "line 1: channel[0] is 'foo'; allowed: 'exchange', 'transport'"),
         ('[chain]\ncontract = "0x12"', "unknown key 'contract' in chain; allowed: "),
         ("[chain]\nconfirmations = true", "chain.confirmations is true; it should be a whole number"),
-        ('[chain]\npoll = "2h"', "chain.poll is '2h'; it should be at most '1m'"),
-        ("[batch]\nsize = 10", "batch.size is 10; it should be at least 33792"),
-        ('[batch]\nsize = "1 KiB"', "batch.size is '1 KiB'; it should be at least '33 KiB'"),
+        ("[chain]\nconfirmations = 101", "chain.confirmations is 101; it should be at most 100"),
+        ('[chain]\npoll = "2h"', "unknown key 'poll' in chain; it is gone since the second edition: the node is asked"),
+        ("[batch]\nsize = 10", "unknown key 'batch'; it is gone since the second edition"),
+        ('[chain]\nurl = "embedded"', "chain.url is not a node's URL"),
+        ('[chain]\nurl = "ws://127.0.0.1:8546"', "chain.url is not a node's URL"),
+        ('[store]\nshare = "1 kB"', "store.share is '1 kB'; it should be at least '1 MiB'"),
+        ('name = "Server 1"', "line 1: name is 'Server 1'; a name has 1 to 63 of a-z"),
+        ("passphrase_file = 1", "passphrase_file is 1; write a path in quotes"),
+        ("[funds]\ngas_per_day = 5", "funds.gas_per_day is 5; it should be at least 1000000"),
         ("[funds]\nby = 6", "funds.by is 6; it should be at most 5"),
         ("[store]\nurl = 3", "store.url is 3; it should be a string in quotes"),
-        ("[batsh]\nsize = 10", "unknown key 'batsh'; did you mean 'batch'?"),
+        ("[stroe]\nshare = 10", "unknown key 'stroe'; did you mean 'store'?"),
     ],
 )
 def test_a_mistake_in_server_toml_is_told(text, sentence):
@@ -205,8 +225,8 @@ def test_a_url_with_a_password_is_not_shown():
 
 def test_all_mistakes_of_a_file_are_told_at_once():
     with pytest.raises(ConfigError) as failure:
-        robot('topics = ["/a"]\nservr = "x:1"\nchannel = "y"\n[spool]\ncommit = "soon"\n')
-    for part in ("line 2: ", "'servr'", "line 3: ", "channel", "line 5: ", "spool.commit"):
+        robot('topics = ["/a"]\nservr = "x:1"\nchannel = "y"\n[spool]\nmax_size = "big"\n')
+    for part in ("line 2: ", "'servr'", "line 3: ", "channel", "line 5: ", "spool.max_size"):
         assert part in str(failure.value)
 
 
@@ -216,14 +236,49 @@ def test_the_line_of_a_repeated_table_is_found():
         robot(text)
 
 
-def test_a_reader_needs_contract_ca_and_identity():
-    with pytest.raises(ConfigError, match="contract is missing; ca is missing; identity is missing"):
-        parse_config(ReaderConfig, "", Path("reader.toml"))
+READER = """
+contract = "0x00000000000000000000000000000000000000aa"
+chain_id = 31337
+genesis = "0x1111111111111111111111111111111111111111111111111111111111111111"
+ca = "ca.crt.pem"
+identity = "."
+"""
 
 
-def test_an_address_that_is_none_is_told():
-    with pytest.raises(ConfigError, match="contract is '0x12'; an address is 0x and 40 hexadecimal digits"):
-        parse_config(ReaderConfig, 'contract = "0x12"', Path("reader.toml"))
+def test_a_reader_says_which_ledger_and_by_which_nodes():
+    config = parse_config(ReaderConfig, READER, Path("/r/reader.toml"))
+    assert config.ledger == ledger_id(31337, b"\x11" * 32, bytes(19) + b"\xaa")
+    assert config.chain == ["http://127.0.0.1:8545"] and config.ca == Path("/r/ca.crt.pem")
+    one = parse_config(ReaderConfig, READER + 'chain = "https://a.example/key"', Path("reader.toml"))
+    many = parse_config(ReaderConfig, READER + 'chain = ["https://a.example/key", "http://[::1]:1"]', Path("r.toml"))
+    assert (len(one.chain), len(many.chain)) == (1, 2) and "key" not in repr(many)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "contract is missing; chain_id is missing; genesis is missing; ca is missing; identity is missing"),
+        ('contract = "0x12"', "contract is '0x12'; an address is 0x and 40 hexadecimal digits"),
+        ('genesis = "0x12"', "genesis is '0x12'; a hash is 0x and 64 hexadecimal digits"),
+        ("chain = []", "chain is empty"),
+        ('chain = ["http://a", "ftp://secretkey@b"]', "chain[1] is not a node's URL"),
+    ],
+)
+def test_a_mistake_in_reader_toml_is_told(text, sentence):
+    with pytest.raises(ConfigError) as failure:
+        parse_config(ReaderConfig, text, Path("reader.toml"))
+    assert sentence in str(failure.value) and "secretkey" not in str(failure.value)
+
+
+@pytest.mark.parametrize("text", ["", 'listen = "127.0.0.1:0"', 'listen = "[::]:7410"', 'public = "0.0.0.0:7410"'])
+def test_robots_are_never_given_an_address_that_is_none(text):
+    with pytest.raises(ConfigError, match='public = "HOST:PORT"'):
+        server(text).address_for_robots()
+
+
+def test_robots_are_given_the_public_address_or_the_one_that_is_listened_on():
+    assert server('public = "robots.example:7410"').address_for_robots() == ("robots.example", 7410)
+    assert server('listen = "192.0.2.7:7410"').address_for_robots() == ("192.0.2.7", 7410)
 
 
 def sections(root):
@@ -274,29 +329,6 @@ def test_no_reader_is_an_error_with_the_way_out(tmp_path):
         named.reader_files(tmp_path)
     (tmp_path / "alice.pem").write_text("")
     assert named.reader_files(tmp_path) == [tmp_path / "alice.pem"]
-
-
-def test_a_key_file_must_be_private(tmp_path):
-    key = tmp_path / "sign.key.pem"
-    with pytest.raises(IdentityError, match="does not exist"):
-        require_private(key)
-    key.write_text("")
-    for mode in (0o644, 0o640, 0o604, 0o620, 0o601):
-        os.chmod(key, mode)
-        with pytest.raises(IdentityError, match=rf"open to others \(mode {mode:04o}\); run `chmod 600"):
-            require_private(key)
-    for mode in (0o600, 0o400):
-        os.chmod(key, mode)
-        assert require_private(key) == key
-
-
-def test_a_missing_file_is_named_by_what_it_is(tmp_path):
-    with pytest.raises(ConfigError, match=r"CA certificate .*ca\.pem does not exist"):
-        require_file(tmp_path / "ca.pem", "CA certificate")
-    with pytest.raises(ConfigError, match="is a folder; name a file"):
-        require_file(tmp_path, "CA certificate")
-    (tmp_path / "ca.pem").write_text("")
-    assert require_file(tmp_path / "ca.pem", "CA certificate").name == "ca.pem"
 
 
 def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):

@@ -7,40 +7,43 @@ from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.config import ReaderConfig, RobotConfig, ServerConfig, parse_config
-from rosbridge_eth.config.models import ROOTS, Section
-from rosbridge_eth.config.reference import rewritten, tables
+from rosbridge_eth.config import parse_config
+from rosbridge_eth.config.models import ROOTS
+from rosbridge_eth.config.reference import described, rewritten, tables
+from rosbridge_eth.config.values import duration_text, parse_seconds, parse_size, size_text
 
 DOCUMENT = (Path(__file__).parents[3] / "docs" / "configuration.md").read_text(encoding="utf-8")
-MODELS = {"robot.toml": RobotConfig, "server.toml": ServerConfig, "reader.toml": ReaderConfig}
 
 
 def test_the_reference_is_up_to_date():
     assert rewritten(DOCUMENT) == DOCUMENT, "run: python -m rosbridge_eth.config.reference docs/configuration.md"
 
 
-def sections(model: type[Section]) -> set[type[Section]]:
-    found = {model}
-    for field in model.model_fields.values():
-        names = set(re.findall(r"\w+Config", repr(field.annotation)))
-        found |= {known for known in Section.__subclasses__() if known.__name__ in names}
-    return found
+@pytest.mark.parametrize("file", ROOTS)
+def test_every_key_is_described_and_nothing_else(file):
+    schema = ROOTS[file].model_json_schema()
+    for section in [schema, *schema.get("$defs", {}).values()]:
+        words = described(section)
+        assert set(words) - {""} == set(section["properties"]), section["title"]
+        assert all(len(text) > 4 for text in words.values())
+    assert tables(file).count("| key | value | default | |") == 1 + len(schema.get("$defs", {}))
 
 
-@pytest.mark.parametrize("model", ROOTS)
-def test_every_key_is_described(model):
-    file = next(name for name, root in MODELS.items() if root is model)
-    for section in sections(model):
-        for name, field in section.model_fields.items():
-            assert field.description, f"{section.__name__}.{name}"
-            assert f"| `{field.alias or name}` |" in tables(file)
+@pytest.mark.parametrize(("seconds", "text"), [(1.0, "1s"), (0.05, "50ms"), (3600, "1h"), (90, "90s"), (604800, "7d")])
+def test_durations_are_shown_as_they_are_written(seconds, text):
+    assert duration_text(seconds) == text and parse_seconds(text) == seconds
 
 
-@pytest.mark.parametrize("heading", MODELS)
+@pytest.mark.parametrize(("size", "text"), [(16384, "16 KiB"), (2**30, "1 GiB"), (1000, "1000 B"), (1536, "1536 B")])
+def test_sizes_are_shown_as_they_are_written(size, text):
+    assert size_text(size) == text and parse_size(text) == size
+
+
+@pytest.mark.parametrize("heading", ROOTS)
 def test_the_examples_are_valid(heading):
     part = DOCUMENT[DOCUMENT.index(f"`{heading}`") :]
     part = part[: part.index("<!-- end -->")]
     examples = re.findall(r"```toml\n(.*?)```", part, re.DOTALL)
     assert examples
     for example in examples:
-        parse_config(MODELS[heading], example, Path(heading))
+        parse_config(ROOTS[heading], example, Path(heading))
