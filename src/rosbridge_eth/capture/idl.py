@@ -25,6 +25,8 @@ _CLOSING = {"}": "{", "]": "[", ">": "<"}
 _MAX_TOKENS = 1 << 14
 _MAX_NESTING = 16
 _MAX_SCOPES = 8
+_MAX_BOUNDS = 128
+"""Lengths of arrays, sequences and strings: rosbags' parser takes up to ten milliseconds for each."""
 
 MakeError = Callable[[str], Exception]
 
@@ -105,7 +107,7 @@ def _check(tokens: list[str], error: MakeError) -> None:
     if len(tokens) > _MAX_TOKENS:
         raise error("it is too long")
     opened: list[str] = []
-    scopes = 0
+    scopes = bounds = 0
     for before, token in zip(["", *tokens], tokens, strict=False):
         if not _PLAIN.fullmatch(token):
             raise error(f"{token!r} is not supported in a message")
@@ -114,6 +116,9 @@ def _check(tokens: list[str], error: MakeError) -> None:
             raise error("it is nested too deeply")
         if token == "sequence" and opened[-1:] == ["<"]:  # noqa: S105 - a keyword of IDL
             raise error("a sequence of sequences is not supported")
+        bounds += token == "[" or (token == "<" and before != "sequence") or (token == "," and opened[-1:] == ["<"])
+        if bounds > _MAX_BOUNDS:
+            raise error("it has too many bounds")
         if token in "{[<":  # noqa: S105 - signs
             opened.append(token)
         elif token in _CLOSING and (not opened or opened.pop() != _CLOSING[token]):

@@ -26,7 +26,7 @@ NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")
 BLOB = decoder_for(Wire.ROS1, "pkg/Blob", "uint8[] data\nint32 x")
 
 
-def Capture(rules, notify=None, **options):  # noqa: N802 - as the class
+def Capture(rules, notify=None, **options):
     said = {} if notify is None else {"notify": notify}
     return AnyCapture(rules, source_kind="sim", **said, **options)
 

@@ -183,7 +183,8 @@ def odometry(wire: Wire) -> bytes:
     whole = decoder_for_known(wire, ODOMETRY)
     absent = Restoration(whole).restore({}).message
     message = types[ODOMETRY](header, "base", absent.pose, absent.twist)
-    return bytes(store.serialize_ros1(message, ODOMETRY) if wire is Wire.ROS1 else store.serialize_cdr(message, ODOMETRY))
+    write = store.serialize_ros1 if wire is Wire.ROS1 else store.serialize_cdr
+    return bytes(write(message, ODOMETRY))
 
 
 @pytest.mark.parametrize(("wire", "other"), [(Wire.ROS1, Wire.CDR), (Wire.CDR, Wire.ROS1)])

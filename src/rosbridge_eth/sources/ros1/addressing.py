@@ -19,13 +19,16 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.ros1.errors import ProtocolError
 
 MASTER_PORT = 11311
 MAX_URI = 512
 
 _HOST = re.compile(r"[A-Za-z0-9_.\-]{1,253}|[0-9A-Fa-f:.]{2,45}", re.ASCII)
 _GRAPH_NAME = re.compile(r"/[A-Za-z0-9_][A-Za-z0-9_/]{0,254}", re.ASCII)
+
+
+class ProtocolError(SourceError):
+    """The peer sent what TCPROS or XML-RPC does not allow, or more than is read. Its connection is closed."""
 
 
 class Endpoint(NamedTuple):

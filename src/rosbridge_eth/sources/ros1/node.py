@@ -1,8 +1,17 @@
-"""Our node in the ROS graph: calls to the master, our own API, and a connection to each publisher. One thread.
+"""Our node in the ROS graph: one thread that looks at the master and compares, and one for each publisher.
 
-What to do comes from `subscriptions`, what bytes mean from `xmlrpc`, `http`,
-`framing` and `publication`; here they meet the sockets. Whatever a peer does
-ends in its own connection being closed, counted, said once, and tried again later.
+Every RESOLVE_EVERY, and when the doorbell rings, the master's state is looked at, and what is missing is done:
+
+    a topic is wanted and we do not stand there    register, which answers with the publishers' APIs
+    others publish it than at the last look        register again, which is idempotent
+    we stand at a topic that is not wanted         unregister
+    we are missing at a topic we registered        the master has restarted
+    our name has another API                       another node took it, and the master dropped us: take another name
+
+The doorbell is publisherUpdate. Anyone may call our API, so nothing is believed from there but that it is time to look.
+Publishers do not register again at a restarted master. So a connection that was there before is kept until it ends by
+itself, although the new master does not list it. Whatever a peer does ends in its own connection being closed, counted,
+said once, and tried again later.
 """
 
 from __future__ import annotations
@@ -11,458 +20,356 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 from rosbridge_eth.capture import RawMessage
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Offer
-from rosbridge_eth.sources.ros1.addressing import Endpoint, bind_host, own_host, read_uri, uri_of
-from rosbridge_eth.sources.ros1.counters import Cause, TopicCounters
-from rosbridge_eth.sources.ros1.errors import ProtocolError, Refusal
-from rosbridge_eth.sources.ros1.framing import Framer, Header, Message, PassedOver, encode_header
-from rosbridge_eth.sources.ros1.graph import offers, system_state, tcpros_endpoint, topic_types, unwrap
-from rosbridge_eth.sources.ros1.http import BodyReader, encode_request, encode_response
-from rosbridge_eth.sources.ros1.loop import CLOSED, Connection, Ended, Loop, Received
-from rosbridge_eth.sources.ros1.publication import Publication, read_publication, request_header
-from rosbridge_eth.sources.ros1.subscriptions import Connect, Disconnect, MasterCall, Say, Subscriptions
-from rosbridge_eth.sources.ros1.xmlrpc import (
-    Value,
-    decode_answer,
-    decode_call,
-    encode_answer,
-    encode_call,
-    encode_fault,
-)
+from rosbridge_eth.sources.ros1 import api
+from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError, bind_host, own_host, uri_of
+from rosbridge_eth.sources.ros1.publisher import FAILURES, LAST_RETRY, Cause, Publisher, TopicCounters
+from rosbridge_eth.sources.ros1.tcpros import ANY, Publication
 from rosbridge_eth.sources.selection import RESOLVE_EVERY, Selection
 
 log = logging.getLogger(__name__)
 
-MASTER_ANSWER = 16 << 20
-"""Bytes of a master's answer; the state of a thousand topics and nodes has a few hundred thousand."""
-PEER_BODY = 1 << 20
-"""Bytes of a publisher's answer, and of a call to us."""
-STALLED = 30.0
-"""Seconds that a publisher may fall silent in the middle of a message."""
-FAREWELL = 0.6
+MAX_TOPICS: Final = 2048
+"""Topics that are watched at once; a pattern may match more than was meant."""
+MAX_CONNECTIONS: Final = 512
+"""Connections to publishers at once: threads, and file descriptors, of which a process usually has 1,024."""
+DOORBELL_REST: Final = 0.1
+"""Seconds between looks at the least, however often the doorbell rings."""
+SMALL: Final = 1 << 14
+"""Bytes of a message that is not counted among those that are arriving."""
+FAREWELL: Final = 0.6
 """Seconds in which the master is told that we leave."""
-MAX_SAID = 2048
+STOP_PATIENCE: Final = 1.0
+MAX_SAID: Final = 2048
 """Things remembered as said."""
 
-
-class RemoteCall:
-    """One XML-RPC call on a connection of its own: an answer or a reason, within the deadline."""
-
-    def __init__(
-        self,
-        loop: Loop,
-        endpoint: Endpoint,
-        body: bytes,
-        answered: Callable[[Value], None],
-        failed: Callable[[Exception], None],
-        *,
-        limit: int,
-        timeout: float,
-    ) -> None:
-        self._answered, self._failed = answered, failed
-        self._reader = BodyReader(request=False, limit=limit)
-        self._connection = loop.connect(*endpoint, self._received, self._ended, time.monotonic() + timeout)
-        self._connection.send(encode_request(*endpoint, "/", body))
-
-    def close(self) -> None:
-        self._connection.close()
-
-    def _received(self, data: memoryview) -> None:
-        try:
-            body = self._reader.feed(data)
-        except ProtocolError as error:
-            self._connection.close()
-            self._failed(error)
-            return
-        if body is not None:
-            self._connection.close()
-            self._take(body)
-
-    def _ended(self, why: str) -> None:
-        if why == CLOSED:
-            try:
-                body = self._reader.end()
-            except ProtocolError:
-                self._failed(ConnectionError(why))
-                return
-            self._take(body)
-        else:
-            self._failed(ConnectionError(why))
-
-    def _take(self, body: bytes) -> None:
-        try:
-            value = decode_answer(body)
-        except (ProtocolError, Refusal) as error:
-            self._failed(error)
-            return
-        self._answered(value)
+@dataclass
+class _Topic:
+    registered: bool = False
+    rung: bool = False  # to be registered again at the next look
+    not_before: float = 0.0  # when to try again after the master refused
+    nodes: list[str] = field(default_factory=list)  # the publishers at the last registration
+    publishers: dict[str, Publisher] = field(default_factory=dict)  # by API
 
 
-@dataclass(frozen=True)
-class NodeLimits:
-    """What the network may cost.
-
-    max_message: bytes of one message. partial: bytes of all messages that are arriving.
-    timeout: seconds for a call, and for a publisher to answer with its header.
-    """
-
-    max_message: int
-    partial: int
-    timeout: float
-
-
-class _Publisher:
-    """One publisher of one topic, from the question where it listens to its last byte."""
-
-    def __init__(self, node: Node, topic: str, uri: str) -> None:
-        self.topic, self.uri = topic, uri
-        self.publication: Publication | None = None
-        self.messages = 0
-        self._node = node
-        self._framer = Framer(node.limits.max_message)
-        self._partial = 0
-        self._call: RemoteCall | None = None
-        self._connection: Connection | None = None
-
-    def begin(self) -> None:
-        """Ask the publisher's node where it listens."""
-        try:
-            api = read_uri(self.uri)
-        except ProtocolError as error:
-            self._fail(error)
-            return
-        self._call = RemoteCall(
-            self._node.loop,
-            api,
-            encode_call("requestTopic", [self._node.name, self.topic, [["TCPROS"]]]),
-            self._located,
-            self._fail,
-            limit=PEER_BODY,
-            timeout=self._node.limits.timeout,
-        )
-
-    def close(self) -> None:
-        for part in (self._call, self._connection):
-            if part is not None:
-                part.close()
-        self._call = self._connection = None
-        self._account(0)
-
-    def _located(self, answer: Value) -> None:
-        try:
-            endpoint = tcpros_endpoint(unwrap(answer))
-        except (ProtocolError, Refusal) as error:
-            self._fail(error)
-            return
-        deadline = time.monotonic() + self._node.limits.timeout
-        self._connection = self._node.loop.connect(*endpoint, self._received, self._lost, deadline)
-        self._connection.send(encode_header(request_header(self.topic, self._node.name)))
-
-    def _received(self, data: memoryview) -> None:
-        try:
-            for event in self._framer.feed(data):
-                match event:
-                    case Message(body):
-                        self.messages += 1
-                        self._node.received(self, body)
-                    case Header(fields):
-                        publication = read_publication(self.topic, fields)
-                        self._node.admit(self, publication)
-                        self.publication = publication
-                    case PassedOver(length):
-                        self._node.passed_over(self, length)
-        except SourceError as error:  # of the protocol, of the definition, or a refusal: each is the publisher's
-            self._fail(error)
-            return
-        self._account(self._framer.buffered)
-        if self._node.partial > self._node.limits.partial:
-            given_up = self._framer.pass_over()
-            if given_up is not None:
-                self._node.passed_over(self, given_up.length)
-                self._account(0)
-        if self._connection is not None and self._framer.header_done:
-            # Before the header is complete, the deadline of the connection stands, however it trickles in.
-            silent = self._framer.between_messages
-            self._connection.deadline = None if silent else time.monotonic() + STALLED
-
-    def _lost(self, why: str) -> None:
-        self._fail(ConnectionError(why))
-
-    def _fail(self, error: Exception) -> None:
-        self.close()
-        self._node.ended(self, error)
-
-    def _account(self, buffered: int) -> None:
-        self._node.partial += buffered - self._partial
-        self._partial = buffered
-
-
-class Node:
-    """Runs in one thread until `stop`. Counters and offers may be read from another."""
+class Node(threading.Thread):
+    """Runs until `leave`. `failure` is what ended it before, for whoever started it to raise."""
 
     def __init__(
-        self, master: Endpoint, host: str | None, name: str, selection: Selection, limits: NodeLimits,
-        backlog: Backlog, counters: dict[str, TopicCounters], clock: Clock,
+        self, master: Endpoint, host: str | None, name: str, selection: Selection, backlog: Backlog,
+        counters: dict[str, TopicCounters], clock: Clock, *, max_message: int, timeout: float,
     ) -> None:  # fmt: skip
-        self.limits = limits
-        self.partial = 0
-        self.loop = Loop()
-        self._master, self._host, self._name, self._selection = master, host, name, selection
+        super().__init__(name="ros1", daemon=True)
+        self.caller_id, self.timeout = name, timeout
+        self.deadlines = api.Deadlines()
+        self.failure: BaseException | None = None
+        self._base_name, self._renamed = name, 0
+        self._master, self._host, self._selection = master, host, selection
         self._backlog, self._counters, self._clock = backlog, counters, clock
-        self._publishers: dict[tuple[str, str], _Publisher] = {}
+        self._max_message, self._arriving = max_message, 0
+        self._topics: dict[str, _Topic] = {}
+        self._publishers: set[Publisher] = set()  # whose threads have not ended
+        self._lock = threading.RLock()  # of what is above and of the counters; never held during a call
+        self._rung, self._leaving = threading.Event(), threading.Event()
+        self._uri = ""
+        self._named = self._answers = self._looked = False
         self._said: dict[str, None] = {}
-        self._timer = 0.0
 
-    @property
-    def name(self) -> str:
-        return self._subscriptions.node
+    def leave(self) -> None:
+        """End within STOP_PATIENCE; the master is told."""
+        self._leaving.set()
+        self._rung.set()
+        self.join(STOP_PATIENCE)
 
-    def run(self, stop: threading.Event) -> None:
-        """Until `stop` is set (and the loop woken); the master is told then that we leave. Raises SourceError."""
+    def run(self) -> None:
+        server = None
         try:
             own = own_host(self._host, self._master)
-            while own is None:
+            while own is None and not self._leaving.is_set():
                 self._say("master", f"there is no way to the master at {self._master}; trying again")
-                if stop.wait(RESOLVE_EVERY):
-                    return
+                self._leaving.wait(RESOLVE_EVERY)
                 own = own_host(self._host, self._master)
-            self._listen(own)
-            while not stop.is_set():
-                now = time.monotonic()
-                if now >= self._timer:
-                    self._act(now)
-                self.loop.turn(self._timer)
-            self._leave()
+            if own is None:
+                return
+            try:
+                server = api.Server(bind_host(own), self._answer, self.timeout)
+            except OSError as error:
+                raise SourceError(f"our ROS node cannot listen for the master's calls: {error.strerror}") from None
+            self._uri = uri_of(own, server.port)
+            while not self._leaving.is_set():
+                self._look()
+                self._leaving.wait(DOORBELL_REST)
+                self._rung.wait(RESOLVE_EVERY)
+        except BaseException as error:  # handed to the thread that runs the source, which raises it
+            self.failure = error
         finally:
-            self.loop.close()
+            self._end(server)
 
-    def _listen(self, own: str) -> None:
-        try:
-            port = self.loop.listen(bind_host(own), self._called, self.limits.timeout)
-        except OSError as error:
-            raise SourceError(f"our ROS node cannot listen for the master's calls: {error.strerror}") from None
-        self._uri = uri_of(own, port)
-        self._subscriptions = Subscriptions(self._selection, self._name, self._uri)
-
-    def _act(self, now: float) -> None:
-        for action in self._subscriptions.actions(now):
-            match action:
-                case MasterCall():
-                    self._call_master(action)
-                case Connect(topic, uri):
-                    publisher = self._publishers[topic, uri] = _Publisher(self, topic, uri)
-                    publisher.begin()
-                case Disconnect(topic, uri):
-                    self._disconnected(self._publishers.pop((topic, uri), None))
-                case Say(key, text):
-                    self._say(key, text)
-        # An action may have failed at once and be due again; otherwise this is when to look again.
-        self._timer = self._subscriptions.next_timer()
-
-    def _changed(self) -> None:
-        self._timer = 0.0
-
-    def _leave(self) -> None:
-        for publisher in self._publishers.values():
-            publisher.close()
+    def _end(self, server: api.Server | None) -> None:
+        with self._lock:
+            registered = [name for name, topic in self._topics.items() if topic.registered]
+            for publisher in self._publishers:
+                publisher.close()
         until = time.monotonic() + FAREWELL
-        calls = self._subscriptions.farewells() if self._subscriptions.master_answers else []
-        under_way: set[MasterCall] = set()
-        while (calls or under_way) and time.monotonic() < until:
-            while calls and len(under_way) < 8:
-                call = calls.pop()
-                under_way.add(call)
-
-                def done(_: object, call: MasterCall = call) -> None:
-                    under_way.discard(call)
-
-                self._remote(call, done, done)
-            self.loop.turn(until)
+        try:
+            for name in registered if self._answers else ():
+                self._call("unregisterSubscriber", name, self._uri, timeout=max(0.01, until - time.monotonic()))
+        except FAILURES:
+            pass  # it will be noticed at the master's next look at us
+        if server is not None:
+            server.close()
+        self.deadlines.close()
 
     # The master
 
-    def _remote(
-        self, call: MasterCall, answered: Callable[[Value], None], failed: Callable[[Exception], None]
-    ) -> None:
-        body = encode_call(call.method, list(call.parameters))
-        RemoteCall(
-            self.loop, self._master, body, answered, failed, limit=MASTER_ANSWER, timeout=self.limits.timeout
-        )  # fmt: skip
+    def _call(self, method: str, *parameters: str, timeout: float | None = None) -> Any:
+        timeout = timeout or self.timeout
+        return api.call(
+            self._master, self.deadlines, timeout, api.MASTER_ANSWER, method, self.caller_id, *parameters
+        )
 
-    def _call_master(self, call: MasterCall) -> None:
-        def answered(answer: Value) -> None:
-            self._subscriptions.answered(call, answer, time.monotonic())
-            self._changed()
+    def _look(self) -> None:
+        """Look at the master's state, and do what is missing."""
+        self._rung.clear()
+        try:
+            self._check_name()
+            publishers, subscribers = api.system_state(self._call("getSystemState"))
+            self._answers = True
+            self._say("master", None)
+            wanted = self._wanted(api.offers(publishers, []))
+            with self._lock:
+                self._compare(wanted, subscribers)
+            for name, nodes in subscribers.items():
+                if self.caller_id in nodes and name not in wanted:
+                    self._call("unregisterSubscriber", name, self._uri)
+            for name in wanted:
+                topic, nodes = self._topics[name], sorted(publishers.get(name, ()))
+                missing = not topic.registered or topic.rung or topic.nodes != nodes
+                if missing and time.monotonic() >= topic.not_before and not self._leaving.is_set():
+                    self._register(name, topic, nodes)
+        except FAILURES as error:
+            self._answers = False
+            why = api.why(error)
+            self._say("master", f"the master does not answer as it should ({why}); asking every {RESOLVE_EVERY:g} s")
 
-        def failed(error: Exception) -> None:
-            self._subscriptions.failed(call, str(error), time.monotonic())
-            self._changed()
+    def _check_name(self) -> None:
+        """Two nodes of one name would push each other out of the master in turn."""
+        try:
+            taken = self._call("lookupNode", self.caller_id) != self._uri
+        except api.Refusal:
+            return  # nobody has our name
+        if taken and self._named:  # otherwise it is a dead one's, which we replace
+            old, self._renamed, self._named = self.caller_id, self._renamed + 1, False
+            new = self.caller_id = f"{self._base_name}_{self._renamed + 1}"
+            self._say(f"name {new}", f"another node has registered as {old}; this one goes on as {new}")
+            for topic in self._topics.values():
+                topic.registered = False
 
-        self._remote(call, answered, failed)
+    def _wanted(self, offers: Sequence[Offer]) -> list[str]:
+        for text in () if self._looked else self._selection.unmatched(offers):
+            self._say(f"unmatched {text}", f"nothing of the name {text} is published yet; waiting for it")
+        self._looked = True
+        matched = (offer.topic for offer in self._selection.resolve(offers))
+        wanted = list(dict.fromkeys([*self._selection.named_topics, *matched]))
+        if len(wanted) > MAX_TOPICS:
+            self._say("topics", f"more than {MAX_TOPICS} topics match; {wanted[MAX_TOPICS]} and others are left out")
+        return wanted[:MAX_TOPICS]
 
-    def _called(self, connection: Connection) -> tuple[Received, Ended]:
-        """Somebody connected to our API."""
-        reader = BodyReader(request=True, limit=PEER_BODY)
+    def _compare(self, wanted: Sequence[str], subscribers: api.NodesByTopic) -> None:
+        for name, topic in list(self._topics.items()):
+            if topic.registered and self.caller_id not in subscribers.get(name, ()):  # the master has restarted
+                topic.registered = self._named = False
+                for publisher in topic.publishers.values():
+                    publisher.kept = publisher.publication is not None
+            if name not in wanted:
+                self._close(topic, [uri for uri, publisher in topic.publishers.items() if not publisher.kept])
+                topic.registered = False
+                if not topic.publishers:
+                    del self._topics[name]
+        for name in wanted:
+            self._topics.setdefault(name, _Topic())
 
-        def received(data: memoryview) -> None:
-            try:
-                body = reader.feed(data)
-                if body is None:
-                    return
-                method, parameters = decode_call(body)
-            except ProtocolError as error:
-                connection.send(encode_response(encode_fault(1, str(error)), "400 Bad Request"), last=True)
-                return
-            connection.send(encode_response(self._answer(method, parameters)), last=True)
+    def _register(self, name: str, topic: _Topic, nodes: list[str]) -> None:
+        topic.rung = False
+        try:
+            uris = api.strings(self._call("registerSubscriber", name, ANY, self._uri))
+        except api.Refusal as error:
+            self._say(f"register {name}", f"the master does not take a subscription to {name}: {error}")
+            topic.not_before = time.monotonic() + LAST_RETRY
+            return
+        self._say(f"register {name}", None)
+        self._named = True
+        with self._lock:
+            topic.registered, topic.nodes = True, nodes
+            known = topic.publishers
+            self._close(topic, [uri for uri, publisher in known.items() if uri not in uris and not publisher.kept])
+            for uri in uris:
+                if uri in known:
+                    known[uri].kept = False
+                elif len(self._publishers) >= MAX_CONNECTIONS:
+                    self._say("room", f"more than {MAX_CONNECTIONS} publishers; some of {name} are left out")
+                    break
+                else:
+                    publisher = known[uri] = Publisher(self, name, uri)
+                    self._publishers.add(publisher)
+                    publisher.start()
 
-        return received, lambda why: None
+    def _close(self, topic: _Topic, uris: Sequence[str]) -> None:
+        for uri in uris:
+            topic.publishers.pop(uri).close()
 
-    def _answer(self, method: str, parameters: list[Value]) -> bytes:
-        """wiki.ros.org/ROS/Slave_API, for a node that only subscribes."""
-        match method:
-            case "publisherUpdate":
-                if len(parameters) == 3 and isinstance(parameters[1], str):
-                    self._subscriptions.doorbell(parameters[1], time.monotonic())
-                    self._changed()
-                return encode_answer([1, "", 0])
-            case "getPid":
-                return encode_answer([1, "", os.getpid()])
-            case "getMasterUri":
-                return encode_answer([1, "", uri_of(*self._master)])
-            case "getName":
-                return encode_answer([1, "", self.name])
-            case "getSubscriptions":
-                pairs: list[Value] = [[topic, self._type_of(topic)] for topic in self._subscriptions.topics]
-                return encode_answer([1, "", pairs])
-            case "getPublications" | "getBusInfo":
-                return encode_answer([1, "", []])
-            case "getBusStats":
-                return encode_answer([1, "", [[], [], []]])
-            case "paramUpdate":
-                return encode_answer([1, "", 0])
-            case "requestTopic":
-                return encode_answer([0, "this node publishes nothing", 0])
-            case "shutdown":
-                # Anyone may call this; what stops the bridge is its own service. A name that was taken shows
-                # at the next look at the master's state.
-                self._say("shutdown", "somebody on the ROS network asked this node to shut down; it goes on")
-                return encode_answer([1, "", 0])
-        return encode_fault(1, "no such method")
+    def _answer(self, method: str, parameters: Sequence[Any]) -> list[Any]:
+        """wiki.ros.org/ROS/Slave_API, for a node that only subscribes. KeyError for another method."""
+        if method == "publisherUpdate" and len(parameters) == 3:
+            with self._lock:
+                topic = self._topics.get(parameters[1]) if isinstance(parameters[1], str) else None
+                if topic is not None:
+                    topic.rung = True
+                    self._rung.set()
+        elif method == "shutdown":
+            # Anyone may call this; what stops the bridge is its own service. That our name was taken shows at
+            # the next look at the master's state.
+            self._say("shutdown", "somebody on the ROS network asked this node to shut down; it goes on")
+        elif method == "requestTopic":
+            return [0, "this node publishes nothing", 0]
+        with self._lock:
+            subscriptions = [[name, self._type_of(topic)] for name, topic in self._topics.items()]
+        answers = {
+            "publisherUpdate": 0, "paramUpdate": 0, "shutdown": 0, "getPid": os.getpid(), "getName": self.caller_id,
+            "getMasterUri": uri_of(*self._master), "getPublications": [], "getBusInfo": [], "getBusStats": [[], [], []],
+            "getSubscriptions": subscriptions,
+        }  # fmt: skip
+        return [1, "", answers[method]]
 
-    def _type_of(self, topic: str) -> str:
-        for (name, _), publisher in self._publishers.items():
-            if name == topic and publisher.publication is not None:
-                return publisher.publication.type_name.replace("/msg/", "/")
-        return "*"
+    def _type_of(self, topic: _Topic) -> str:
+        found = (publisher.publication for publisher in topic.publishers.values())
+        return next((each.type_name.replace("/msg/", "/") for each in found if each is not None), api.UNKNOWN_TYPE)
 
     # The publishers
 
-    def admit(self, publisher: _Publisher, publication: Publication) -> None:
-        """One type for a topic at a time, as ROS has it: that of the publishers read from already."""
-        for (topic, _), other in self._publishers.items():
-            if topic == publisher.topic and other.publication is not None and other.publication.md5 != publication.md5:
-                raise Refusal(
-                    f"{publication.node} publishes {publication.type_name} ({publication.md5}) where "
-                    f"{other.publication.node} publishes {other.publication.type_name} ({other.publication.md5})"
-                )
-        counters = self._counters_of(publisher.topic)
-        counters.connections += 1
-        counters.connected += 1
+    def admit(self, publisher: Publisher, publication: Publication) -> None:
+        """One type for a topic at a time, as ROS has it: that of the publishers read from already. Raises Refusal."""
+        with self._lock:
+            for other in self._publishers:
+                known = other.publication if other.topic == publisher.topic else None
+                if known is not None and known.md5 != publication.md5:
+                    raise api.Refusal(
+                        f"{publication.node} publishes {publication.type_name} ({publication.md5}) where "
+                        f"{known.node} publishes {known.type_name} ({known.md5})"
+                    )
+            publisher.publication = publication
+            counters = self._counters_of(publisher.topic)
+            counters.connections += 1
+            counters.connected += 1
         log.info("%s: reading %s from %s", publisher.topic, publication.type_name, publication.node or publisher.uri)
 
-    def received(self, publisher: _Publisher, body: bytes) -> None:
-        """A message is complete."""
-        publication = publisher.publication
-        if publication is None:
-            return
-        counters = self._counters_of(publisher.topic)
-        counters.received += 1
-        counters.bytes += len(body)
-        if publication.latching and publisher.messages == 1:
-            counters.latched += 1
-        self._backlog.put(
-            RawMessage(publisher.topic, publication.type_name, self._clock.wall_ns(), body, publication.decoder)
-        )
+    def make_room(self, length: int) -> bool:
+        """Whether a message of this length is read now: of all that are arriving, at most two of the largest."""
+        if length <= SMALL:
+            return length <= self._max_message
+        with self._lock:
+            if length > self._max_message or self._arriving + length > 2 * self._max_message:
+                return False
+            self._arriving += length
+            return True
 
-    def passed_over(self, publisher: _Publisher, length: int) -> None:
+    def free_room(self, length: int) -> None:
+        """It has arrived, or will not."""
+        if length > SMALL:
+            with self._lock:
+                self._arriving -= length
+
+    def received(self, topic: str, publication: Publication, body: bytes, *, latched: bool) -> None:
+        """A message is complete."""
+        received_ns = self._clock.wall_ns()
+        with self._lock:
+            counters = self._counters_of(topic)
+            counters.received += 1
+            counters.bytes += len(body)
+            counters.latched += latched
+        self._backlog.put(RawMessage(topic, publication.type_name, received_ns, body, publication.decoder))
+
+    def passed_over(self, publisher: Publisher, length: int) -> None:
         """A message is not read."""
-        self._counters_of(publisher.topic).too_large += 1
+        with self._lock:
+            self._counters_of(publisher.topic).too_large += 1
         self._say(
             f"too large {publisher.topic}",
-            f"{publisher.topic}: a message of {length} bytes is left out; at most {self.limits.max_message} bytes of a "
-            f"message are read, and {self.limits.partial} of all that are arriving",
+            f"{publisher.topic}: a message of {length} bytes is left out; at most {self._max_message} bytes of a "
+            f"message are read, and {2 * self._max_message} of all that are arriving",
         )
 
-    def ended(self, publisher: _Publisher, error: Exception) -> None:
+    def ended(self, publisher: Publisher, error: Exception) -> None:
         """A connection was not made, or was lost, or was ended by us for what came."""
-        if isinstance(error, ProtocolError):
-            cause = Cause.PROTOCOL
-        elif isinstance(error, SourceError):
-            cause = Cause.REFUSED
-        else:
-            cause = Cause.CLOSED if publisher.publication is not None else Cause.UNREACHABLE
-        self._counters_of(publisher.topic).ended[cause] += 1
-        text = f"{publisher.topic}: the publisher at {publisher.uri[:200]}: {error}"
+        with self._lock:
+            connected, publisher.publication = publisher.publication is not None, None
+            counters = self._counters_of(publisher.topic)
+            counters.connected -= connected
+            if publisher.over.is_set():
+                return
+            if isinstance(error, ProtocolError):
+                cause = Cause.PROTOCOL
+            elif isinstance(error, SourceError):
+                cause = Cause.REFUSED
+            else:
+                cause = Cause.CLOSED if connected else Cause.UNREACHABLE
+            counters.ended[cause] += 1
+            if (topic := self._topics.get(publisher.topic)) is not None:
+                topic.rung = True  # it may have started anew somewhere else
+        text = f"{publisher.topic}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
         if cause is Cause.CLOSED:
             log.info("%s", text)
         else:
             key = f"publisher {publisher.topic} {publisher.uri}"
             self._say(key, f"{text}; trying again, further failures are counted")
-        where = (publisher.topic, publisher.uri)
-        if self._publishers.get(where) is publisher:
-            del self._publishers[where]
-        self._disconnected(publisher)
-        self._subscriptions.connection_ended(*where, time.monotonic())
-        self._changed()
 
-    def _disconnected(self, publisher: _Publisher | None) -> None:
-        if publisher is None:
-            return
-        publisher.close()
-        if publisher.publication is not None:
-            publisher.publication = None
-            self._counters_of(publisher.topic).connected -= 1
+    def gone(self, publisher: Publisher) -> None:
+        """Its thread ends."""
+        with self._lock:
+            self._publishers.discard(publisher)
+            topic = self._topics.get(publisher.topic)
+            if topic is not None and topic.publishers.get(publisher.uri) is publisher:
+                del topic.publishers[publisher.uri]
+                topic.rung = True
 
     def _counters_of(self, topic: str) -> TopicCounters:
-        found = self._counters.get(topic)
-        if found is None:
-            found = self._counters[topic] = TopicCounters()
-        return found
+        return self._counters.setdefault(topic, TopicCounters())
 
     def _say(self, key: str, text: str | None) -> None:
-        if text is None:
-            if self._said.pop(key, "absent") is None:
-                log.info("%s: in order again", key)
-            return
-        if key not in self._said:
-            while len(self._said) >= MAX_SAID:
-                del self._said[next(iter(self._said))]
-            self._said[key] = None
+        """For the log, once for each key; None as text: it is over, say it anew the next time."""
+        with self._lock:
+            known = key in self._said
+            if text is None:
+                self._said.pop(key, None)
+            elif not known:
+                while len(self._said) >= MAX_SAID:
+                    del self._said[next(iter(self._said))]
+                self._said[key] = None
+        if text is None and known:
+            log.info("%s: in order again", key)
+        elif text is not None and not known:
             log.warning("%s", text)
 
 
 def ask_offers(master: Endpoint, name: str, timeout: float) -> tuple[Offer, ...]:
-    """What is published now, asked once, with sockets of its own. Raises SourceError."""
-    loop = Loop()
-    answers: list[Value] = []
-    errors: list[Exception] = []
+    """What is published now, asked once. Raises SourceError."""
+    deadlines = api.Deadlines()
     try:
-        for method in ("getSystemState", "getTopicTypes"):
-            body = encode_call(method, [name])
-            RemoteCall(loop, master, body, answers.append, errors.append, limit=MASTER_ANSWER, timeout=timeout)
-            wanted = len(answers) + 1
-            while len(answers) < wanted and not errors:
-                loop.turn(time.monotonic() + 1.0)
-            if errors:
-                raise SourceError(f"the ROS master at {master} does not answer: {errors[0]}")
-        return offers(system_state(unwrap(answers[0]))[0], topic_types(unwrap(answers[1])))
-    except (ProtocolError, Refusal) as error:
+        state, types = (
+            api.call(master, deadlines, timeout, api.MASTER_ANSWER, method, name)
+            for method in ("getSystemState", "getTopicTypes")
+        )
+        return api.offers(api.system_state(state)[0], types)
+    except (ProtocolError, api.Refusal) as error:
         raise SourceError(f"the ROS master at {master} does not answer as it should: {error}") from None
+    except OSError as error:
+        raise SourceError(f"the ROS master at {master} does not answer: {api.why(error)}") from None
     finally:
-        loop.close()
+        deadlines.close()

@@ -1,29 +1,27 @@
 """A live ROS 1 graph as a source, with no ROS installed.
 
-Two threads: one has the sockets (`node`) and never waits for anybody; the
-caller's own takes messages from the backlog and emits them. So `emit` may
-block for as long as it likes: what then finds no room is dropped, oldest first,
-and counted. Publishers are never held up.
+The threads of the `node` receive, and never wait for anybody; the caller's own takes messages from the backlog and
+emits them. So `emit` may block for as long as it likes: what then finds no room is dropped, oldest first, and counted.
+Publishers are never held up.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from rosbridge_eth.capture import Decoder
 from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
 from rosbridge_eth.sources.ros1.addressing import master_endpoint, node_name
-from rosbridge_eth.sources.ros1.counters import TopicCounters
-from rosbridge_eth.sources.ros1.node import Node, NodeLimits, ask_offers
+from rosbridge_eth.sources.ros1.node import Node, ask_offers
+from rosbridge_eth.sources.ros1.publisher import TopicCounters
 from rosbridge_eth.sources.selection import Selection
 
 TAKE_PATIENCE = 0.1
 """Seconds after which the emitting thread looks whether it is to stop."""
-STOP_PATIENCE = 1.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +45,7 @@ class Ros1Settings:
 class Ros1Source:
     """The chosen topics of a master. It waits for a master that is not there yet; nothing is asked before `run`."""
 
+    kind = "ros1"
     live = True
 
     def __init__(self, settings: Ros1Settings, selection: Selection, clock: Clock | None = None) -> None:
@@ -71,7 +70,8 @@ class Ros1Source:
         """By topic, as of now; from any thread."""
         dropped = self._backlog.dropped
         return {
-            topic: counters.copy(dropped=dropped.get(topic, 0)) for topic, counters in list(self._counters.items())
+            topic: replace(counters, dropped=dropped.get(topic, 0), ended=dict(counters.ended))
+            for topic, counters in list(self._counters.items())
         }
 
     @property
@@ -84,34 +84,20 @@ class Ros1Source:
 
         Raises SourceError.
         """
-        settings = self._settings
-        limits = NodeLimits(settings.max_message, 2 * settings.max_message, settings.timeout)
         node = Node(
-            self._master, settings.hostname, self._name, self._selection, limits,
-            self._backlog, self._counters, self._clock,
+            self._master, self._settings.hostname, self._name, self._selection, self._backlog, self._counters,
+            self._clock, max_message=self._settings.max_message, timeout=self._settings.timeout,
         )  # fmt: skip
-        leave = threading.Event()
-        failure: list[BaseException] = []
-
-        def read() -> None:
-            try:
-                node.run(leave)
-            except BaseException as error:  # carried over to the caller's thread, which raises it
-                failure.append(error)
-
-        network = threading.Thread(target=read, name="ros1", daemon=True)
-        network.start()
+        node.start()
         try:
-            while not stop.is_set() and not self._closed.is_set() and network.is_alive():
+            while not stop.is_set() and not self._closed.is_set() and node.is_alive():
                 message = self._backlog.take(TAKE_PATIENCE)
                 if message is not None:
                     emit(message)
         finally:
-            leave.set()
-            node.loop.wake()
-            network.join(STOP_PATIENCE)
-        if failure:
-            raise failure[0]
+            node.leave()
+        if node.failure is not None:
+            raise node.failure
 
     def close(self) -> None:
         """Let `run` end, if it is running."""

@@ -113,7 +113,7 @@ class Listening:
                  tolerant: bool = False, **settings: object) -> None:
         chosen = replace(Ros1Settings(master=uri, hostname="127.0.0.1"), **settings)  # type: ignore[arg-type]
         self.source = Ros1Source(chosen, Selection(topics, nodes))
-        self.capture = Capture([TopicRule("**", fields=("*",), limit=4096)])
+        self.capture = Capture([TopicRule("**", limit=4096)], source_kind="ros1")
         self.raw: list[RawMessage] = []
         self.data: dict[str, list] = {}
         self.stop = threading.Event()
@@ -144,7 +144,7 @@ class Listening:
 
     def keep(self, raw: RawMessage) -> None:
         self.raw.append(raw)
-        record = self.capture.process(raw, time.time_ns(), time.monotonic_ns())
+        record = self.capture.process(raw, time.time_ns())
         if record is None:
             assert self._tolerant, f"{raw.topic} cannot be captured"
             return

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.ros1.addressing import (
     Endpoint,
+    ProtocolError,
     bind_host,
     is_graph_name,
     master_endpoint,
@@ -20,7 +21,6 @@ from rosbridge_eth.sources.ros1.addressing import (
     read_uri,
     uri_of,
 )
-from rosbridge_eth.sources.ros1.errors import ProtocolError
 
 MASTER = Endpoint("127.0.0.1", 11311)
 

@@ -29,8 +29,8 @@ from bridge.sources.ros1.impostors import (
     numbered,
     saying,
 )
-from rosbridge_eth.sources.ros1 import Cause, node
-from rosbridge_eth.sources.ros1.framing import encode_header
+from rosbridge_eth.sources.ros1 import Cause, publisher
+from rosbridge_eth.sources.ros1.tcpros import encode_header
 
 MIB = 2**20
 
@@ -150,7 +150,7 @@ def test_a_publisher_that_never_finishes_its_header_is_given_up(master, conversa
 
 
 def test_a_publisher_that_stops_within_a_message_is_given_up(master, monkeypatch):
-    monkeypatch.setattr(node, "STALLED", 0.3)
+    monkeypatch.setattr(publisher, "STALLED", 0.3)
     hostile = Publisher(saying(changed() + numbered(7) + b"\x08\0\0\0\1\2", then_stay=True))
     master.publishers["/t"] = [hostile.uri]
     with closing_all(hostile), Listening(master.uri, ["/t", "/good"]) as listening:
@@ -230,7 +230,7 @@ def test_our_api_takes_any_bytes_from_anyone(master):
                 try:
                     caller.sendall(data)
                     caller.shutdown(socket.SHUT_WR)
-                    assert caller.recv(1000)[:12] in (b"HTTP/1.0 400", b"")
+                    assert b"<methodResponse>" not in caller.recv(10_000)
                 except (ConnectionResetError, BrokenPipeError):
                     pass  # closed before all was said
         silent = [socket.create_connection((host, int(port)), 5) for _ in range(200)]

@@ -5,21 +5,14 @@ from __future__ import annotations
 import threading
 import time
 import xmlrpc.client
-from functools import partial
 
 import pytest
 
 from bridge.sources.ros1.graph import Graph, Listening, eventually
-from rosbridge_eth.capture import Capture, CapturedRecord, RawMessage, TopicRule
+from rosbridge_eth.capture import Capture, RawMessage, Restoration, TopicRule, definition_line, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.identity import sign, verify
-from rosbridge_eth.records import robot_id
-from rosbridge_eth.robot.recorder import Recorder
-from rosbridge_eth.sealing import Kind, Opener, Sealer, read_opening
 from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, sample_bag
 from rosbridge_eth.sources.ros1 import Cause, Ros1Settings, Ros1Source
-from rosbridge_eth.store import Spool
-from smcrypto import sm2
 
 pytestmark = pytest.mark.service
 
@@ -279,34 +272,30 @@ def test_messages_are_dropped_and_counted_while_nobody_takes_them(graph):
     assert listening.source.statistics()["/flood"].dropped == dropped == 200 - len(numbers)
 
 
-def test_what_a_robot_publishes_is_sealed_and_spooled(graph, tmp_path):
-    """rospy to the records that leave the robot: the Recorder as a robot runs it, and a reader who opens them."""
-    robot_key, reader = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
-    robot = robot_id("robot_1")
-    with Spool(tmp_path / "spool.sqlite", robot) as spool:
-        sealer = Sealer(robot, partial(sign, robot_key), [reader.public_key])
-        recorder = Recorder(Capture([TopicRule("/sealed/**")]), sealer, spool)
+def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
+    """rospy to lines, and from the lines alone back to the bytes that rospy sent, a type of nobody's included."""
+    capture = Capture([TopicRule("/logged/**")], source_kind=Ros1Source.kind, live=True)
+    found: list[tuple[RawMessage, bytes]] = []
 
-        def take(raw: RawMessage) -> None:
-            recorder.take(raw, wall_ns=time.time_ns(), mono_ns=time.monotonic_ns(), now=time.monotonic())
+    def take(raw: RawMessage) -> None:
+        found.append((raw, capture.process(raw, time.time_ns(), True).line))
 
-        listening = Listening(graph.uri, ["/sealed/**"])
-        listening.take = take
-        with listening:
-            graph.publish(
-                "sealed",
-                {"topic": "/sealed/odom", "kind": "odometry", "count": 40, "rate": 50},
-                {"topic": "/sealed/report", "kind": "report", "count": 5, "rate": 10},
-            )
-            eventually(lambda: recorder.times.records == 45, "45 records")
-        recorder.finish(wall_ns=time.time_ns(), now=time.monotonic())
-        opening, *records, end = sorted(spool.pending(100, 1 << 22), key=lambda record: record.id.seq)
-    verified = partial(verify, robot_key.public_key)
-    stream = Opener(reader).grant(read_opening(opening, verified))
-    assert stream.open(end, verified).kind is Kind.END
-    found = [CapturedRecord.from_json(stream.open(record, verified).payload) for record in records]
-    odometry = [record for record in found if record.topic == "/sealed/odom"]
-    assert [record.data["pose"]["pose"]["position"]["x"] for record in odometry] == [n / 8 for n in range(40)]
-    assert all(0 < record.wall_ns - record.received_ns < 10**10 for record in found)
-    reports = [record.data for record in found if record.topic == "/sealed/report"]
-    assert [len(report["readings"]) for report in reports] == [0, 1, 2, 3, 4]
+    listening = Listening(graph.uri, ["/logged/**"])
+    listening.take = take
+    with listening:
+        graph.publish(
+            "logged",
+            {"topic": "/logged/odom", "kind": "odometry", "count": 40, "rate": 50},
+            {"topic": "/logged/report", "kind": "report", "count": 5, "rate": 10},
+        )
+        eventually(lambda: len(found) == 45, "45 records")
+    restorations = {
+        raw.type_name: Restoration(parse_line(definition_line(raw.decoder)).decoder()) for raw, _ in found
+    }
+    assert restorations.keys() == {"nav_msgs/msg/Odometry", "fleet_msgs/msg/Report"}
+    for raw, line in found:
+        record, restoration = parse_line(line), restorations[raw.type_name]
+        assert (record.source, record.clock) == ("ros1", True)
+        assert 0 < record.captured_ns - record.received_ns < 10**10
+        assert restoration.decoder.encode(restoration.restore(record.data).message) == raw.raw
+    assert capture.lost(listening.source.dropped) == []

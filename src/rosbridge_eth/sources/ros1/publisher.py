@@ -1,0 +1,153 @@
+"""One thread for each publisher: ask where it listens, connect, read; and again, later and later, when that ends."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources.ros1 import api
+from rosbridge_eth.sources.ros1.addressing import read_uri
+from rosbridge_eth.sources.ros1.tcpros import (
+    Publication,
+    pass_over,
+    read_exactly,
+    read_header,
+    read_length,
+    read_publication,
+    request_header,
+)
+
+if TYPE_CHECKING:
+    from rosbridge_eth.sources.ros1.node import Node
+
+FIRST_RETRY: Final = 0.1
+LAST_RETRY: Final = 10.0
+"""Seconds between attempts to reach a publisher: doubled at each failure."""
+STEADY: Final = 10.0
+"""A connection that lasted so long was a good one: the next attempt is the first again."""
+STALLED = 30.0
+SLOWEST: Final = 100_000
+"""A message is to arrive within STALLED seconds, and one more for so many bytes."""
+FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError)
+"""What a peer can bring about: it says what is wrong, is gone or silent, or has a name that is none."""
+
+
+
+class Cause(StrEnum):
+    """Why a connection to a publisher ended, or was not made."""
+
+    UNREACHABLE = "unreachable"  # no answer, refused, name does not resolve, timed out
+    CLOSED = "closed"  # by the publisher, in good order as far as one can see
+    REFUSED = "refused"  # the publisher will not, or cannot be recorded: another type, no definition, a bad one
+    PROTOCOL = "protocol"  # what it sent is not TCPROS or XML-RPC
+
+
+@dataclass(slots=True)
+class TopicCounters:
+    """Of one topic, since the source was opened.
+
+    received: messages read completely; each is emitted, still waiting, or dropped.
+    dropped: messages given up because those before them were not taken fast enough.
+    too_large: messages above the size that is read.
+    latched: messages received as the first of a connection to a latching publisher, so perhaps not for the first time.
+    connected: publishers read from now. connections: headers accepted so far. ended: by cause.
+    """
+
+    received: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    too_large: int = 0
+    latched: int = 0
+    connected: int = 0
+    connections: int = 0
+    ended: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(Cause, 0))
+
+
+class Publisher(threading.Thread):
+    """Reads one publisher of one topic, again and again until it is closed; what comes of it, the node is told.
+
+    kept: the master does not list it any more; it is over when its connection ends.
+    """
+
+    def __init__(self, node: Node, topic: str, uri: str) -> None:
+        super().__init__(name=f"ros1 {topic}", daemon=True)
+        self.topic, self.uri = topic, uri
+        self.publication: Publication | None = None
+        self.kept = False
+        self.over = threading.Event()
+        self._node = node
+        self._socket: socket.socket | None = None
+
+    def close(self) -> None:
+        """Without waiting: a name server that hangs may hold the thread for a while."""
+        self.over.set()
+        if (sock := self._socket) is not None:
+            api.hang_up(sock)
+
+    def run(self) -> None:
+        failures = 0
+        while not self.over.is_set():
+            began = time.monotonic()
+            try:
+                self._connect()
+            except FAILURES as error:
+                self._node.ended(self, error)
+            if self.kept:
+                break
+            failures = 0 if time.monotonic() - began >= STEADY else failures
+            self.over.wait(min(LAST_RETRY, FIRST_RETRY * 2.0 ** min(failures, 16)))
+            failures += 1
+        self._node.gone(self)
+
+    def _connect(self) -> None:
+        node, topic = self._node, self.topic
+        answer = api.call(
+            read_uri(self.uri), node.deadlines, node.timeout, api.PEER_BODY,
+            "requestTopic", node.caller_id, topic, [["TCPROS"]],
+        )  # fmt: skip
+        with (
+            socket.create_connection(api.tcpros_endpoint(answer), node.timeout) as sock,
+            sock.makefile("rb") as stream,
+        ):
+            _tune(sock)
+            self._socket = sock
+            if self.over.is_set():
+                return
+            with node.deadlines.within(sock, node.timeout):
+                sock.sendall(request_header(topic, node.caller_id))
+                publication = read_publication(topic, read_header(stream))
+            node.admit(self, publication)
+            self._read(sock, stream, publication)
+
+    def _read(self, sock: socket.socket, stream: BinaryIO, publication: Publication) -> None:
+        first = publication.latching
+        while True:
+            length = read_length(stream)  # until then, silence is no fault
+            with self._node.deadlines.within(sock, STALLED + length / SLOWEST):
+                self._take(stream, length, publication, latched=first)
+            first = False
+
+    def _take(self, stream: BinaryIO, length: int, publication: Publication, *, latched: bool) -> None:
+        if not self._node.make_room(length):
+            self._node.passed_over(self, length)
+            pass_over(stream, length)
+            return
+        try:
+            self._node.received(self.topic, publication, read_exactly(stream, length), latched=latched)
+        finally:
+            self._node.free_room(length)
+
+
+def _tune(sock: socket.socket) -> None:
+    """Blocking, without delay; notice within about two minutes that the other machine is gone."""
+    sock.settimeout(None)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 6)):
+        if (option := getattr(socket, name, None)) is not None:
+            sock.setsockopt(socket.IPPROTO_TCP, option, value)
