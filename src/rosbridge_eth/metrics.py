@@ -9,31 +9,37 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import threading
 import time
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from http import HTTPStatus
-from typing import Any, Final
-from wsgiref.simple_server import WSGIRequestHandler, make_server
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client import CollectorRegistry, Gauge
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, ThreadingWSGIServer, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 
+from rosbridge_eth.channel import Statistics
 from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.inbox import Inbox, Waiting
+from rosbridge_eth.ledger.contract import WEI_PER_ETH
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger.submitter import Submitter
+    from rosbridge_eth.robot import Robot
+    from rosbridge_eth.server import Worker
 
 SILENCE: Final = 15.0  # seconds without a beat after which a process counts as hanging
 BEAT_EVERY: Final = 1.0
 DEADLINE: Final = 10.0  # seconds for a client to send its request and take the answer
-LATENCIES: Final = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
-"""Upper bounds in seconds: from a local chain's block to a node that was away for half an hour."""
+LITTLE_ROOM: Final = 64 << 20  # bytes; below this the disk counts as full
 
 REGISTRY = CollectorRegistry()
-
-
-def _counter(name: str, help: str, *labels: str) -> Counter:
-    return Counter(f"rosbridge_eth_{name}", help, labels, registry=REGISTRY)
 
 
 def _gauge(name: str, help: str, *labels: str) -> Gauge:
@@ -43,26 +49,20 @@ def _gauge(name: str, help: str, *labels: str) -> Gauge:
 CHANNEL = _gauge("channel", "Counts of the channel since the process began, by what was counted.", "process", "count")
 DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by reason.", "process", "reason")
 CHUNKS = _gauge("chunks", "Chunks that arrived, by what became of them.", "process", "outcome")
-RECORDS_STORED = _counter("records_stored", "Records stored by the server.", "robot")
+STORED = _gauge("records_stored", "Records stored since the process began.", "process", "robot")
 WAITING = _gauge("waiting_chunks", "Chunks in the inbox that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
 OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
-BALANCE = _gauge("balance_eth", "Balance of the robot's account, and of the operator's.", "robot")
+BALANCE = _gauge("treasury_eth", "Balance of the operator's account.")
 HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` says why.", "robot")
-WRITTEN = _counter("records_written", "Records seen confirmed on the chain.", "robot")
-GAS = _counter("gas_used", "Gas of the transactions seen in blocks.", "robot")
-LATENCY = Histogram(
-    "rosbridge_eth_confirm_seconds", "From the inbox's commit to the confirmation on the chain.", registry=REGISTRY,
-    buckets=LATENCIES,
-)  # fmt: skip
+SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "count")
 HEAD = _gauge("head_block", "Number of the node's latest block.")
 HEAD_AGE = _gauge("head_age_seconds", "Age of that block by its own timestamp.")
 DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the store is.")
-RESTARTS = _counter("process_restarts", "How often a process was started again.", "process")
 BEAT = _gauge("beat_seconds", "When the process last took a turn, seconds since 1970.", "process")
 CONDITION = _gauge("condition", "1 while the condition holds; /readyz lists them.", "name")
 
-CAPTURED = _counter("captured", "Records captured by this robot.")
+CAPTURED = _gauge("captured", "Records captured since the process began.")
 LOST = _gauge("lost", "Messages that were not captured, by topic and why; the log says so, too.", "topic", "why")
 SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored by the server, set aside.", "state")
 SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.")
@@ -140,7 +140,7 @@ class Web:
         self._expected = expected
         server = type("_Server6", (_Server,), {"address_family": socket.AF_INET6}) if ":" in address[0] else _Server
         try:
-            self._http = make_server(address[0], address[1], self._answer, server, _Handler)
+            self._http: WSGIServer = make_server(address[0], address[1], self._answer, server, _Handler)
         except OSError as error:
             raise NetworkError(
                 f"TCP port {address[1]} of {address[0]} cannot be opened: {error.strerror}; correct `monitor`"
@@ -175,6 +175,73 @@ class Web:
         headers = [("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store")]
         start_response(f"{status.value} {status.phrase}", headers)
         return [body]
+
+
+# What each process shows of itself, once a second
+
+
+def show_channel(process: str, counted: Statistics, lost_sends: int) -> None:
+    for name, value in asdict(counted).items():
+        if name == "dropped":
+            for reason, count in value.items():
+                DROPPED.labels(process, reason).set(count)
+        else:
+            CHANNEL.labels(process, name).set(value)
+    CHANNEL.labels(process, "lost_sends").set(lost_sends)
+
+
+def show_worker(process: str, worker: Worker, wall: float) -> None:
+    """A worker's channel, and what became of the chunks that reached it."""
+    reception = worker.reception
+    beat(process, wall)
+    show_channel(process, reception.server.statistics(), worker.loop.lost_sends)
+    for outcome, count in reception.counts.items():
+        CHUNKS.labels(process, outcome).set(count)
+    for robot, records in reception.records.items():
+        STORED.labels(process, robot).set(records)
+    CONDITION.labels(f"{process} stores chunks").set(reception.trouble.why is None)
+
+
+def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str], folder: Path, wall: float) -> None:
+    """What waits for the chain, and whether it gets there. Raises StoreError."""
+    beat("submitter", wall)
+    waiting = inbox.totals()
+    for tk, name in names.items():
+        held = waiting.get(tk, Waiting(0, 0, 0, None))
+        WAITING.labels(name).set(held.chunks)
+        WAITING_BYTES.labels(name).set(held.bytes)
+        OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
+        HELD.labels(name).set(inbox.state(tk).hold is not None)
+    for what, count in submitter.counts.items():
+        SUBMITTER.labels(what).set(count)
+    if submitter.head is not None:
+        HEAD.set(submitter.head.number)
+        HEAD_AGE.set(max(0.0, wall - submitter.head.time))
+    if submitter.operator_balance is not None:
+        BALANCE.set(submitter.operator_balance / WEI_PER_ETH)
+    room = shutil.disk_usage(folder).free
+    DISK_FREE.set(room)
+    CONDITION.labels("node answers").set(submitter.trouble is None)
+    CONDITION.labels("treasury can pay").set(submitter.funds is None)
+    CONDITION.labels("disk has room").set(room >= LITTLE_ROOM)
+
+
+def show_robot(robot: Robot) -> None:
+    """A robot's capture, spool and session. Raises StoreError."""
+    beat("robot", time.time())
+    show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
+    CAPTURED.set(robot.captured)
+    for topic, count in robot.source.dropped.items():
+        LOST.labels(topic, "dropped").set(count)
+    for topic, counted in robot.capture.statistics().items():
+        LOST.labels(topic, "refused").set(counted.refused + counted.undecodable)
+    spool = robot.spool.statistics()
+    for state, chunks in (("all", spool.chunks), ("not stored", spool.unstored), ("set aside", spool.aside)):
+        SPOOL_CHUNKS.labels(state).set(chunks)
+    SPOOL_BYTES.set(spool.bytes)
+    CONNECTED.set(robot.sender.statistics.connected)
+    CONDITION.labels("robot has a session").set(robot.sender.statistics.connected)
+    CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)
 
 
 def reference() -> str:

@@ -19,7 +19,7 @@ from rosbridge_eth.channel.udp import UdpLoop
 from rosbridge_eth.chunk import Altered, Chunk, ChunkError, Forged, Log, robot_id, verify
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import PeerIdentity
-from rosbridge_eth.inbox import Head, Inbox, Outcome
+from rosbridge_eth.inbox import Head, Inbox, InboxExchanged, Outcome
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
 
@@ -68,7 +68,7 @@ class Reception:
         allowed: Callable[[PeerIdentity], bool],
         certificates: Callable[[str], bytes | None],
     ) -> None:
-        self._server, self._inbox, self._ledger = server, inbox, ledger
+        self.server, self._inbox, self._ledger = server, inbox, ledger
         self._allowed, self._certificates = allowed, certificates
         self.sessions: dict[bytes, Session] = {}
         self._gone: dict[str, Session] = {}  # by name: sessions that a newer one of the same identity replaced
@@ -109,7 +109,7 @@ class Reception:
             message = protocol.decode_up(payload)
         except ProtocolError as error:
             log.warning("%s: %s; its session is closed", session.peer, error)
-            self._server.close_connection(session.connection, now, End.PROTOCOL)
+            self.server.close_connection(session.connection, now, End.PROTOCOL)
             return
         match message:
             case Where(stream=stream):
@@ -136,7 +136,7 @@ class Reception:
         except ChunkError as error:
             self.counts["malformed"] += 1
             log.warning("%s: sends what is no chunk (%s); its session is closed", session.peer, error)
-            self._server.close_connection(session.connection, now, End.PROTOCOL)
+            self.server.close_connection(session.connection, now, End.PROTOCOL)
             return None
         try:
             verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, chunk)
@@ -173,8 +173,13 @@ class Reception:
         for session in self.sessions.values():
             session.offers = []
         try:
-            outcomes = self._inbox.append([(session.tk, chunk) for session, chunk in gathered], wall)
+            chunks = [(session.tk, chunk) for session, chunk in gathered]
+            outcomes = self._inbox.append(chunks, wall) if chunks else []
             self.trouble.now(None)
+        except InboxExchanged as error:  # what robots were told is void: they ask again in a new session
+            log.error("%s; all sessions begin anew", error)
+            self.server.close(now)
+            return
         except StoreError as error:
             self.trouble.now(str(error))
             self._hold([*asked, *(session for session, _ in gathered)], "the server's store is away", now)
@@ -227,7 +232,7 @@ class Reception:
         for session in list(self.sessions.values()):
             if not self._allowed(session.peer):
                 log.warning("%s is no longer allowed; its session is closed", session.peer)
-                self._server.close_peer(session.peer.name, now, role=session.peer.role)
+                self.server.close_peer(session.peer.name, now, role=session.peer.role)
                 continue
             try:
                 state = self._inbox.state(session.tk)
@@ -260,11 +265,11 @@ class Reception:
 
     def _send(self, session: Session, message: Stored | Confirmed | Hold | Refused) -> None:
         encoded = protocol.encode(message)
-        if self._server.writable(session.connection, len(encoded)):
-            self._server.send(session.connection, encoded)
+        if self.server.writable(session.connection, len(encoded)):
+            self.server.send(session.connection, encoded)
         else:  # it takes none of our packets: it comes back with a new session, and asks
             log.warning("%s: takes no answers; its session is closed", session.peer)
-            self._server.close_connection(session.connection, time.monotonic())
+            self.server.close_connection(session.connection, time.monotonic())
 
     def _compare(self, session: Session, before: Session | None, now: float) -> None:
         """A session that took the place of a living one: perhaps two machines have one identity."""
@@ -278,10 +283,8 @@ class Reception:
 class Worker:
     """Drives a Reception over a socket until told to stop."""
 
-    def __init__(
-        self, server: Server, reception: Reception, make_loop: Callable[[Callable[[Event], None]], UdpLoop]
-    ) -> None:
-        self.server, self.reception = server, reception
+    def __init__(self, reception: Reception, make_loop: Callable[[Callable[[Event], None]], UdpLoop]) -> None:
+        self.reception = reception
         self.loop = make_loop(lambda event: reception.handle(event, time.monotonic()))
 
     def run(self, stopped: Callable[[], bool], *, on_turn: Callable[[], None] = lambda: None) -> None:
@@ -292,6 +295,6 @@ class Worker:
             self.reception.turn(time.monotonic(), time.time())
             on_turn()
         self.reception.commit(time.monotonic(), time.time())
-        self.server.close(time.monotonic())
+        self.reception.server.close(time.monotonic())
         self.loop.step(0.0)
         self.loop.close()

@@ -21,21 +21,26 @@ from multiprocessing.process import BaseProcess
 from socket import AF_UNIX, SOCK_CLOEXEC, SOCK_DGRAM
 from socket import socket as Socket
 from types import FrameType
+from typing import TYPE_CHECKING
 
-from rosbridge_eth.administration import certificates_hash, server_trust
+from rosbridge_eth.administration import server_trust
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
-from rosbridge_eth.identity import Identity
+from rosbridge_eth.identity import Identity, Role
 from rosbridge_eth.inbox import Inbox, open_inbox
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.contract import Ledger
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.ledger.submitter import Settings as SubmitterSettings
 from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.server import Reception, Worker
+
+if TYPE_CHECKING:
+    from eth_account.signers.local import LocalAccount
 
 log = logging.getLogger(__name__)
 
@@ -92,18 +97,37 @@ def open_reception(
     limits = config.limits
     server = Server(
         ServerConfig(
-            modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number, max_connections=limits.connections,
-            handshake_share=limits.handshake_share, source_rate=limits.source_rate,
+            modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number,
+            max_connections=limits.connections, handshake_share=limits.handshake_share, source_rate=limits.source_rate,
         ),
         identity,
         server_trust(home, registry),
         cookie_key(identity),
         time.monotonic(),
     )
-    return Reception(
-        server, inbox, deployment.ledger, allowed=registry.allows,
-        certificates=lambda name: certificates_hash(registry, name),
-    )
+
+    def certificates(name: str) -> bytes | None:
+        found = registry.find(Role.ROBOT, name)
+        return None if found is None else found.hash
+
+    return Reception(server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates)
+
+
+def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
+    """The submitter for all robots of a registry."""
+
+    def account(tk: bytes) -> LocalAccount | None:
+        found = registry.robots().get(tk)
+        return None if found is None else keys.robot(found.number)
+
+    return Submitter(
+        ledger, inbox, lambda: registry.robots().keys(), account, keys.operator,
+        SubmitterSettings(
+            confirmations=config.chain.confirmations, max_fee=int(config.chain.max_fee_gwei * 10**9),
+            low_water=int(config.funds.below * WEI_PER_ETH), top_up=int(config.funds.by * WEI_PER_ETH),
+            gas_per_day=config.funds.gas_per_day,
+        ),
+    )  # fmt: skip
 
 
 class Supervisor:
@@ -161,7 +185,11 @@ class Supervisor:
     def _check(self) -> None:
         """The chain is the right one and the store keeps what it is given: only then may a robot be answered."""
         Registry(self._home.registry).close()
-        Ledger.connect(self._config.chain.url, self._deployment).close()
+        ledger = Ledger.connect(self._config.chain.url, self._deployment)
+        try:
+            ledger.check()
+        finally:
+            ledger.close()
         inbox = open_store(self._config, self._home)
         try:
             inbox.check()
@@ -223,11 +251,11 @@ class Supervisor:
                 number, self._config, self._secrets.identity, self._home, registry, inbox, self._deployment
             )
             worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
-            beats = _Beats()
+            beats = Beats()
 
             def show() -> None:
                 if beats.due():
-                    metrics.worker(name, worker, time.time())
+                    metrics.show_worker(name, worker, time.time())
 
             worker.run(_terminated(self._pid), on_turn=show)
 
@@ -242,16 +270,22 @@ class Supervisor:
         registry, inbox = Registry(self._home.registry), self._open_store()
         submitter = open_submitter(self._config, ledger, inbox, registry, self._secrets.keys)
         store = Trouble(log, "the store")
-        beats = _Beats()
+        troubles = {
+            "trouble": Trouble(log, "the node"), "unconfirmed": Trouble(log, "confirmation"),
+            "funds": Trouble(log, "the treasury"),
+        }  # fmt: skip
+        beats = Beats()
         while not asked():
             wait = FIRST_PAUSE
             try:
                 wait = submitter.turn(time.time())
+                for name, trouble in troubles.items():
+                    trouble.now(getattr(submitter, name))
+                if beats.due():
+                    metrics.show_submitter(submitter, inbox, registry.names(), self._home.path, time.time())
                 store.now(None)
             except StoreError as error:
                 store.now(str(error))
-            if beats.due():
-                metrics.submitter(submitter, inbox, registry, self._home.path, time.time())
             stopped.wait(min(wait, FIRST_PAUSE))
 
     def _monitor_task(self, address: tuple[str, int], expected: list[str]) -> Callable[[], None]:
@@ -274,7 +308,7 @@ class Supervisor:
         return open_store(self._config, self._home)
 
 
-class _Beats:
+class Beats:
     """Says once a second that the figures are due."""
 
     def __init__(self) -> None:

@@ -1,33 +1,38 @@
-"""Spool to inbox through a bad network, in simulated time: every record stored once, whatever restarts.
+"""Writer to inbox through a bad network, in simulated time: every line stored once and in order, whatever restarts.
 
-The real spool, sender, channel, reception and inbox; only the network and the
-clock are simulated. What is asserted is what the inbox gives out.
+The real writer, spool, sender, channel, reception and inbox; only the network and the clock are simulated. What is
+asserted is what the inbox holds, opened with the reader's key.
 """
 
 from __future__ import annotations
 
 import os
 import random
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
 
+from bridge.channel.simulation import Faults, Network
 from rosbridge_eth import identity as ids
-from rosbridge_eth.channel import Client, ClientConfig, Event, MessageReceived, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.simulation import Faults, Network
-from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.protocol import Ack, RecordStatus, Registration
-from rosbridge_eth.records import RecordId, SealedRecord
-from rosbridge_eth.robot.sender import Sender
-from rosbridge_eth.server.reception import Reception
-from rosbridge_eth.store import Delivery, InboxLimits, Spool, SqliteInbox
+from rosbridge_eth.channel import Client, ClientConfig, Event, Server, ServerConfig, cookie_key
+from rosbridge_eth.chunk import Chunk, Log, content_key, drop, open_lines, robot_id, seal
+from rosbridge_eth.errors import StoreError
+from rosbridge_eth.inbox.sqlite import SqliteInbox
+from rosbridge_eth.sender import Sender
+from rosbridge_eth.server import HELD, MISMATCH, Reception
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.writer import LogWriter
 
 BIRTH = datetime(2026, 1, 1, tzinfo=UTC)
 ROBOT_ADDRESS, SERVER_ADDRESS = ("192.0.2.2", 5000), ("192.0.2.1", 7410)
 SEEDS = range(int(os.environ.get("DELIVERY_SEEDS", "4")))
 BAD = Faults(loss=0.3, duplication=0.1, corruption=0.05, delay=0.02, jitter=0.05)
+LEDGER = bytes(range(32))
+STREAM_LINE = b'{"stream":{}}'
+MIB = 1 << 20
 
 
 @cache
@@ -40,8 +45,7 @@ def identity(role: ids.Role) -> ids.Identity:
     return ids.enrol(authority(), role, "hub" if role is ids.Role.SERVER else "robot_1", at=BIRTH)
 
 
-def trust() -> ids.Trust:
-    return ids.Trust((authority().certificate,))
+PLACE = Log(LEDGER, robot_id("robot_1"))
 
 
 def wall() -> datetime:
@@ -51,37 +55,48 @@ def wall() -> datetime:
 class World:
     """One robot and one server over one network, both of which can be started again."""
 
-    def __init__(self, folder: Path, seed: int, faults: Faults, *, release: str = "stored",
-                 limits: InboxLimits | None = None) -> None:
+    def __init__(self, folder: Path, seed: int, faults: Faults, *, room: int = 64 * MIB) -> None:
         self.network = Network(seed, faults)
-        self.folder, self.release, self.limits = folder, release, limits or InboxLimits()
-        self.states: dict[RecordId, str] = {}
-        self.registration = Registration(True, "0xA", "0xC", 1, 1)
-        self.arrived: list[MessageReceived] = []
+        self.random = random.Random(seed)
+        self.folder, self.room = folder, room
+        self.allowed, self.certificates = True, b"c" * 32
+        self.lines: list[bytes] = []
+        self.unspooled_lines = 0
         self.open_server()
         self.server_host = self.network.attach(self.server, SERVER_ADDRESS, self.on_server_event)
         self.open_robot()
         self.robot_host = self.network.attach(self.client, ROBOT_ADDRESS, self.on_robot_event)
         self.client.connect(SERVER_ADDRESS, self.network.now)
 
+    def open_inbox(self) -> SqliteInbox:
+        return SqliteInbox(self.folder / "inbox.sqlite", LEDGER, self.room, self.room)
+
     def open_server(self) -> None:
-        self.inbox = SqliteInbox(self.folder / "inbox.sqlite", self.limits)
-        self.server = Server(ServerConfig(), identity(ids.Role.SERVER), trust(), cookie_key(identity(ids.Role.SERVER)),
-                             self.network.now, wall=wall, stopwatch=lambda: 0.0)
+        self.inbox = self.open_inbox()
+        self.server = Server(ServerConfig(), identity(ids.Role.SERVER), ids.Trust((authority().certificate,)),
+                             cookie_key(identity(ids.Role.SERVER)), self.network.now, wall=wall, stopwatch=lambda: 0.0)
         self.reception = Reception(
-            self.server, self.inbox, status_of=lambda id: RecordStatus(self.states.get(id, "stored")),
-            registration_of=lambda peer: self.registration,
+            self.server, self.inbox, LEDGER, allowed=lambda peer: self.allowed, certificates=lambda name: b"c" * 32
         )
 
     def open_robot(self) -> None:
-        robot = identity(ids.Role.ROBOT)
-        self.spool = Spool(self.folder / "spool.sqlite", robot.public.robot_id)
-        self.client = Client(ClientConfig(), robot, trust(), "hub", self.network.now, wall=wall)
-        self.sender = Sender(self.client, self.spool, release=self.release)  # type: ignore[arg-type]
+        key = identity(ids.Role.ROBOT).signing_key
+        self.spool = Spool(self.folder / "spool.sqlite", PLACE, max_bytes=64 * MIB, drop=partial(drop, PLACE, key))
+        self.writer = LogWriter(
+            PLACE, key, [identity(ids.Role.ROBOT).encryption_key.public_key], previous=self.spool.last_digest,
+            stream_line=STREAM_LINE, now=self.network.now, randomness=self.random.randbytes,
+        )
+        self.client = Client(ClientConfig(), identity(ids.Role.ROBOT), ids.Trust((authority().certificate,)), "hub",
+                             self.network.now, wall=wall)
+        self.sender = Sender(self.client, self.spool)
+        self.sender.begin_stream = self.begin_stream
+
+    def begin_stream(self, refused: bytes) -> None:
+        if refused == self.writer.stream:
+            self.writer.new_stream()
 
     def restart_server(self) -> None:
-        self.arrived.clear()  # heard and not committed: lost with the process
-        self.inbox.close()
+        self.inbox.close()  # what was heard and not committed is lost with the process
         self.open_server()
         self.server_host.endpoint = self.server
 
@@ -92,173 +107,204 @@ class World:
         self.client.connect(SERVER_ADDRESS, self.network.now)
 
     def on_server_event(self, event: Event) -> None:
-        if isinstance(event, MessageReceived):
-            self.arrived.append(event)
+        self.reception.handle(event, self.network.now)
 
     def on_robot_event(self, event: Event) -> None:
         self.sender.handle(event, self.network.now)
 
+    def capture(self, count: int) -> None:
+        """So many lines, sealed and spooled at once."""
+        for _ in range(count):
+            self.lines.append(b'{"n":%d}' % len(self.lines))
+            self.writer.add(self.lines[-1], self.network.now)
+        for chunk in self.writer.closed(self.network.now + 1.0, 0):
+            self.spool.append(chunk)
+
     def turn(self) -> None:
         """What both processes do between two waits."""
-        arrived, self.arrived = self.arrived, []
-        self.reception.take(arrived, wall=self.network.now, now=self.network.now)
-        self.spool.commit(self.network.now)
+        self.reception.turn(self.network.now, self.network.now)
         self.sender.send(self.network.now)
 
-    def run(self, seconds: float) -> bool:
-        """Until the robot has nothing left to do; False if that takes longer than so many simulated seconds."""
+    def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        """Until the server has all there is, or `until`; False if that takes more than so many simulated seconds."""
         end = self.network.now + seconds
         while self.network.now < end:
             self.turn()
-            if self.sender.idle:
+            if until() if until else self.sender.idle and self.sender.statistics.connected:
                 return True
             self.network.at(self.network.now + 0.05, lambda: None)
             self.network.step()
         return False
 
-    def keep(self, records: list[SealedRecord]) -> None:
-        for record in records:
-            self.spool.append([record], Delivery.RELIABLE, self.network.now)
+    def stored(self) -> list[Chunk]:
+        """What the inbox holds of the robot, in its order."""
+        rows = self.inbox.rows(PLACE.tk, None, 10_000)
+        return [Chunk.parse(data) for data in self.inbox.chunks(PLACE.tk, [row.position for row in rows])]
 
-    def stored(self) -> list[SealedRecord]:
-        found: list[SealedRecord] = []
-        while leased := self.inbox.lease("test", limit=1000, max_bytes=1 << 24, now=self.network.now, ttl=1e6):
-            found += [entry.record for entry in leased]
-            self.inbox.done([entry.record.id for entry in leased], self.network.now)
-        return found
+    def stored_lines(self) -> list[bytes]:
+        lines: list[bytes] = []
+        for chunk in self.stored():
+            key = content_key(chunk.header, identity(ids.Role.ROBOT).encryption_key)
+            lines += [line for line in open_lines(PLACE, chunk, key) if line != STREAM_LINE]
+        return lines
 
-
-def records(count: int, stream: int = 1) -> list[SealedRecord]:
-    robot = identity(ids.Role.ROBOT).public.robot_id
-    return [
-        SealedRecord(RecordId(robot, bytes([stream]) * 16, seq), random.Random(seq).randbytes(256 + seq % 3 * 256))
-        for seq in range(count)
-    ]
+    def assert_linked(self) -> None:
+        headers = [chunk.header for chunk in self.stored()]
+        assert [header.previous for header in headers] == [bytes(32), *(header.digest for header in headers[:-1])]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_record_is_stored_once_through_a_bad_network(tmp_path: Path, seed: int) -> None:
+def test_everything_arrives_once_and_in_order_through_a_bad_network(tmp_path: Path, seed: int) -> None:
     world = World(tmp_path, seed, BAD)
-    sealed = records(120)
-    world.keep(sealed)
-    assert world.run(600), f"seed {seed}"
-    assert world.stored() == sealed
-    assert world.sender.statistics.stored == len(sealed)
+    for _ in range(30):
+        world.capture(40)
+        world.run(0.4, until=lambda: False)
+    assert world.run(120)
+    assert world.stored_lines() == world.lines
+    world.assert_linked()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_restarts_of_either_end_lose_and_double_nothing(tmp_path: Path, seed: int) -> None:
     world = World(tmp_path, seed, BAD)
-    sealed = records(150)
-    world.keep(sealed)
-    draw = random.Random(seed)
-    for _ in range(4):
-        world.run(draw.uniform(0.5, 4))
-        draw.choice([world.restart_server, world.restart_robot])()
-    assert world.run(600), f"seed {seed}"
-    assert world.stored() == sealed
+    for _ in range(25):
+        world.capture(20)
+        world.run(world.random.uniform(0, 3), until=lambda: False)
+        draw = world.random.random()
+        if draw < 0.2:
+            world.restart_server()
+        elif draw < 0.4:
+            world.restart_robot()
+    assert world.run(300)
+    assert world.stored_lines() == world.lines
+    world.assert_linked()
 
 
-def test_a_full_inbox_makes_the_robot_wait_and_not_lose(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults(), limits=InboxLimits(records=30))
-    sealed = records(100)
-    world.keep(sealed)
-    got: list[SealedRecord] = []
+def test_a_full_share_makes_the_robot_hold_and_go_on_without_a_hole(tmp_path: Path) -> None:
+    world = World(tmp_path, 1, Faults(), room=8_000)
+    for _ in range(40):
+        world.capture(10)
+    assert world.run(30, until=lambda: world.sender.statistics.held is not None)
+    before = len(world.stored())
+    assert 0 < before < 40
     for _ in range(60):
-        if world.run(5):
+        rows = world.inbox.rows(PLACE.tk, None, 10_000)
+        world.inbox.confirm(PLACE.tk, rows[-1].position, world.network.now)
+        kept = world.stored()  # before they go
+        world.lines_seen = getattr(world, "lines_seen", [])
+        world.lines_seen += [chunk.header.number for chunk in kept]
+        world.inbox.forget(world.network.now + 1)
+        if world.run(2 * HELD, until=lambda: world.sender.idle):
             break
-        got += world.stored()
-    assert world.sender.statistics.busy > 0
-    assert got + world.stored() == sealed
+    rows = world.inbox.rows(PLACE.tk, None, 10_000)
+    numbers = world.lines_seen + [chunk.header.number for chunk in world.stored()]
+    assert sorted(set(numbers)) == list(range(40)), "a chunk that was offered while the robot had to hold is not lost"
+    assert rows
 
 
-def test_a_disk_error_at_the_server_is_not_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rosbridge_eth.errors import StoreError
-
-    world = World(tmp_path, 1, Faults())
-    world.keep(records(5))
-    healthy = world.inbox.append
-
-    def broken(*_: object) -> None:
-        raise StoreError("the disk is full")
-
-    monkeypatch.setattr(world.inbox, "append", broken)
-    assert not world.run(5)
-    assert world.reception.trouble == "the disk is full"
-    assert world.reception.acks[Ack.STORED] == 0
-    monkeypatch.setattr(world.inbox, "append", healthy)
-    assert world.run(30)
-    assert world.stored() == records(5)
-
-
-def test_a_conflict_is_told_and_does_not_block_what_follows(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults())
-    sealed = records(10)
-    world.inbox.append([SealedRecord(sealed[3].id, b"other bytes" * 20)], world.network.now)
-    world.keep(sealed)
+def test_confirmed_chunks_leave_the_spool(tmp_path: Path) -> None:
+    world = World(tmp_path, 2, BAD)
+    world.capture(50)
     assert world.run(60)
-    assert world.sender.statistics.conflicts == 1
-    assert len(world.stored()) == 10
-    assert [letter.record for letter in world.inbox.dead_letters()] == [sealed[3]]
+    assert world.spool.statistics().chunks == 1
+    [row] = world.inbox.rows(PLACE.tk, None, 10)
+    world.inbox.confirm(PLACE.tk, row.position, world.network.now)
+    assert world.run(60, until=lambda: world.spool.statistics().chunks == 0)
 
 
-def test_a_record_beyond_the_bound_is_refused_and_does_not_block(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults())
-    sealed = records(3)
-    sealed[1] = SealedRecord(sealed[1].id, bytes(33 * 1024))
-    world.keep(sealed)
+def test_a_lost_inbox_is_filled_again_with_what_is_not_confirmed(tmp_path: Path) -> None:
+    world = World(tmp_path, 3, Faults())
+    for _ in range(10):
+        world.capture(10)
     assert world.run(60)
-    assert world.sender.statistics.refused == 1
-    assert world.stored() == [sealed[0], sealed[2]]
+    world.inbox.close()
+    for file in tmp_path.glob("inbox.sqlite*"):
+        file.unlink()
+    world.open_server()
+    world.server_host.endpoint = world.server
+    world.capture(10)
+    assert world.run(300)
+    assert world.stored_lines() == world.lines
 
 
-def test_by_choice_records_stay_until_the_chain_has_them(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults(), release="confirmed")
-    sealed = records(20)
-    world.keep(sealed)
-    assert not world.run(10)
-    assert world.sender.statistics.stored == 20
-    assert world.spool.statistics.records == 19  # the first, which opens the stream, is not counted
-    world.states = {record.id: "confirmed" for record in sealed[:-1]}
-    assert not world.run(10)
-    world.states[sealed[-1].id] = "dead"
-    assert world.run(10)
-    assert world.sender.statistics.confirmed == 19
+def test_another_chunk_under_the_same_number_is_refused_and_a_new_stream_begins(tmp_path: Path) -> None:
+    world = World(tmp_path, 4, Faults())
+    other = seal(PLACE, identity(ids.Role.ROBOT).signing_key, [b'{"other":1}'], stream=world.writer.stream, number=0,
+                 previous=bytes(32), sealed_ms=0, readers=[identity(ids.Role.ROBOT).encryption_key.public_key])
+    world.inbox.append([(PLACE.tk, other)], 0.0)
+    first = world.writer.stream
+    # The robot asks about number 1 on: what it would send first is above what is there, so only number 0 is a loss.
+    world.capture(5)
+    assert world.run(60)
+    world.capture(5)
+    assert world.run(60)
+    assert world.stored_lines()[0] == b'{"other":1}'
+    assert world.stored_lines()[1:] == world.lines[5:]
+    assert world.writer.stream == first
 
 
-def test_by_choice_a_record_that_the_server_lost_is_sent_again(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults(), release="confirmed")
-    sealed = records(5)
-    world.keep(sealed)
-    assert not world.run(3)
-    world.states[sealed[2].id] = "unknown"
-    assert not world.run(3)
-    assert world.sender.statistics.sent > 5
-    world.states = {record.id: "confirmed" for record in sealed}
-    assert world.run(10)
+def test_a_chunk_signed_by_another_key_is_refused_and_the_robot_goes_on_in_a_new_stream(tmp_path: Path) -> None:
+    world = World(tmp_path, 5, Faults())
+    stranger = ids.enrol(authority(), ids.Role.ROBOT, "robot_1", at=BIRTH)  # the name's identity before it was replaced
+    forged = seal(PLACE, stranger.signing_key, [b'{"old":1}'], stream=world.writer.stream, number=0,
+                  previous=bytes(32), sealed_ms=0, readers=[stranger.encryption_key.public_key])
+    world.spool.append(forged)
+    first = world.writer.stream
+    assert world.run(60, until=lambda: world.sender.statistics.refused == 1)
+    assert world.writer.stream != first
+    world.capture(5)
+    assert world.run(60)
+    assert world.stored_lines() == world.lines
+    assert world.spool.statistics().aside == 1
 
 
-def test_the_robot_learns_its_registration_and_the_servers_time(tmp_path: Path) -> None:
-    world = World(tmp_path, 1, Faults())
-    times: list[float] = []
-    world.sender._on_server_time = times.append
-    world.keep(records(1))
-    assert world.run(20)
-    assert world.sender.statistics.registration == world.registration
-    assert times == [wall().timestamp()]
+def test_a_robot_whose_certificates_the_contract_does_not_have_is_told_to_hold(tmp_path: Path) -> None:
+    world = World(tmp_path, 6, Faults())
+    world.inbox.set_state(PLACE.tk, certificates_hash=b"d" * 32)
+    world.capture(5)
+    assert world.run(60, until=lambda: world.sender.statistics.held == MISMATCH)
+    assert world.stored() == []
+    world.inbox.set_state(PLACE.tk, certificates_hash=b"c" * 32)
+    assert world.run(60)
+    assert world.stored_lines() == world.lines
 
 
-@pytest.mark.parametrize("payload", [b"", b"\x09", b"stored", b"{}"])
-def test_an_answer_that_is_none_ends_the_robot_with_a_sentence_and_keeps_the_records(
-    tmp_path: Path, payload: bytes, monkeypatch: pytest.MonkeyPatch
+def test_a_store_that_is_away_makes_robots_hold_until_it_is_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    world = World(tmp_path, 1, Faults())
-    sealed = records(3)
-    world.keep(sealed)
-    monkeypatch.setattr(Reception, "_acknowledge", lambda self, message, ack: self._reply(message, payload))
-    with pytest.raises(NetworkError, match="same version"):
-        world.run(20)
-    monkeypatch.undo()
-    world.restart_robot()
+    world = World(tmp_path, 7, Faults())
+
+    def away(*arguments: object) -> list[object]:
+        raise StoreError("the disk is full; make room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SqliteInbox, "append", away)
+        world.capture(5)
+        assert world.run(60, until=lambda: world.sender.statistics.held is not None)
+        world.run(3 * HELD, until=lambda: False)
+        assert world.stored() == []
     assert world.run(60)
-    assert world.stored() == sealed
+    assert world.stored_lines() == world.lines
+    assert "the disk is full" in caplog.text
+    assert "the inbox: well again" in caplog.text
+
+
+def test_a_session_of_somebody_who_is_revoked_ends_within_two_seconds(tmp_path: Path) -> None:
+    world = World(tmp_path, 8, Faults())
+    world.capture(5)
+    assert world.run(60)
+    world.allowed = False
+    assert world.run(2, until=lambda: not world.sender.statistics.connected)
+
+
+@pytest.mark.parametrize("junk", [b"", b"\x02", b"\x02junk", b"\x01" + bytes(10), b"\xff" * 100])
+def test_what_is_no_message_ends_the_session_and_nothing_else(tmp_path: Path, junk: bytes) -> None:
+    world = World(tmp_path, 9, Faults())
+    world.capture(5)
+    assert world.run(60)
+    world.client.send(junk)
+    sessions = world.sender.statistics.sessions
+    assert world.run(60, until=lambda: world.sender.statistics.sessions > sessions)
+    world.capture(5)
+    assert world.run(60)
+    assert world.stored_lines() == world.lines

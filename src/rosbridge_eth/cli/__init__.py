@@ -1,7 +1,7 @@
 """The command line: parses, calls, prints. Data goes to stdout, talk to stderr.
 
-Exit codes are those of rosbridge_eth.errors.ExitCode; a failure a person can
-act on is one sentence on stderr and never a traceback.
+Exit codes are those of rosbridge_eth.errors.ExitCode; a failure a person can act on is one sentence on stderr and
+never a traceback.
 """
 
 from __future__ import annotations
@@ -10,11 +10,14 @@ import os
 import sqlite3
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
-from rosbridge_eth.cli import demo, doctor, operator, reader, robot, status
-from rosbridge_eth.cli.output import talk
+from rosbridge_eth import demo, doctor, status
+from rosbridge_eth.cli import operator, reader, robot
+from rosbridge_eth.cli.terminal import talk
 from rosbridge_eth.errors import BridgeError, ExitCode
 
 app = typer.Typer(
@@ -22,12 +25,25 @@ app = typer.Typer(
     help="From the name of a ROS topic to a verified record on an Ethereum chain.\n\n"
     "Begin with `demo`; docs/walkthrough.md goes through everything else in ten minutes.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 for part in (demo, operator, robot, reader, status, doctor):
     part.add_commands(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"rosbridge-eth {version('pysmcrypto')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    shown: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None:
+    """See `app`'s help."""
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -1,127 +1,115 @@
-"""`read`: from the chain to JSON lines, a bag or a plot, with what is wrong said on stderr."""
+"""`read`: what a robot wrote, proven, from the chain alone."""
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rosbridge_eth.cli.options import OPERATOR_HOME, OperatorHomeOption
-from rosbridge_eth.cli.output import Json, print_json, talk
+from rosbridge_eth.cli.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
+from rosbridge_eth.config import load_reader_config
 from rosbridge_eth.config.values import parse_time
 from rosbridge_eth.errors import ConfigError, VerificationError
-from rosbridge_eth.home import OperatorHome
+from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
 
 if TYPE_CHECKING:
-    from rosbridge_eth.reader import Reading
-
-OWNER = "owner"
-"""The reader that `init` makes."""
+    from rosbridge_eth.reading import ProvenRecord
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth read robot_1 --topic /robot_1/odom --plot path.png")(read)
+    app.command(epilog="Example: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl")(read)
 
 
 def _time(text: str | None) -> int | None:
-    if text is None:
-        return None
     try:
-        return parse_time(text)
+        return None if text is None else parse_time(datetime.fromisoformat(text))
     except ValueError as error:
-        raise ConfigError(f"the time {error}") from error
+        raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
 
 
 def read(
     robot: Annotated[str, typer.Argument(help="The robot's name.")],
-    home: OperatorHomeOption = OPERATOR_HOME,
-    config: Annotated[
-        Path | None, typer.Option(help="A reader.toml: contract, CA, identity and node; then no home is needed.")
-    ] = None,
-    reader: Annotated[str | None, typer.Option(help="Which reader of the home reads.", show_default="owner")] = None,
-    passphrase_file: Annotated[
-        Path | None, typer.Option(help="Read the reader's passphrase from the first line of this file.")
-    ] = None,
+    home: ReaderHomeOption = READER_HOME,
     topic: Annotated[str | None, typer.Option(help="Only this topic.")] = None,
-    from_: Annotated[str | None, typer.Option("--from", help="Only from this time on (RFC 3339).")] = None,
-    to: Annotated[str | None, typer.Option(help="Only before this time (RFC 3339).")] = None,
-    at: Annotated[str | None, typer.Option(help="The state at this moment: each topic's last record by then.")] = None,
-    bag: Annotated[
-        Path | None,
-        typer.Option(help="Write a bag that ROS tools open: NAME.bag (ROS 1), NAME.mcap, NAME.db3, or NAME, a folder."),
-    ] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw the trajectory (.png, .svg, .pdf).")] = None,
+    from_: Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")] = None,
+    to: Annotated[str | None, typer.Option(help="Only what was received before this time.")] = None,
+    at: Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")] = None,
+    bag: Annotated[Path | None, typer.Option(help="Write NAME.bag (ROS 1), NAME.mcap, NAME.db3 or a folder.")] = None,
+    csv: Annotated[Path | None, typer.Option(help="Write a table.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw the trajectory: .png, .svg or .pdf.")] = None,
+    node: Annotated[list[str] | None, typer.Option(help="Ask these nodes, not those of reader.toml.")] = None,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="The fingerprints of new certificates are compared and right.")
+    ] = False,
+    passphrase_file: PassphraseFile = None,
     json: Json = False,
-    from_block: Annotated[int | None, typer.Option(min=0, help="Read the chain from this block on.")] = None,
 ) -> None:
-    """Read a robot's records back from the chain and prove them. JSON lines go to stdout unless a bag or plot is asked.
+    """Fetch a robot's log from the chain, prove it, open it, and give its records as JSON lines, bag, table or plot.
 
-    Exits with 9 where anything is altered, forged, missing or doubled.
+    Exits with 9 where what the chain has is not what the robot wrote, or not all of it.
     """
-    from rosbridge_eth.cli.reading_ends import open_reader
-    from rosbridge_eth.reader import Choice, read_robot
-    from rosbridge_eth.reading import outputs
+    from rosbridge_eth.identity import Trust, load_identity
+    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.reading import Bookmarks, outputs, read_robot
 
-    choice = Choice(topic, _time(from_), _time(to), _time(at))
+    choice = outputs.Choice(topic, _time(from_), _time(to), _time(at))
     if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
         raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
     if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
         raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
-    if config is not None and reader is not None:
-        raise typer.BadParameter("a reader.toml names its reader itself: give one of the two", param_hint="--reader")
+    place = ReaderHome(home).require()
+    config = load_reader_config(place.config)
     if bag is not None:
         outputs.check_bag(bag)
+    if csv is not None:
+        outputs.check_table(csv)
+    trajectory = None if plot is None else outputs.Trajectory()
     if plot is not None:
         outputs.check_picture(plot)
-    who = reader or OWNER
-    end = open_reader(OperatorHome(home), config, who, lambda: read_passphrase(
-        "reader", "Passphrase of the reader" if config else f"Passphrase of reader {who}", file=passphrase_file))
-    try:
+    passphrase = read_passphrase("reader", "Passphrase of the reader", file=passphrase_file)
+    identity, roots = load_identity(config.identity, passphrase)
+    ledgers = [Ledger.connect(url, config) for url in node or config.chain]
+    bookmarks = Bookmarks(place.path / "bookmarks.json")
+    chosen, topics = 0, set[str]()
+    with ExitStack() as stack:
+        for ledger in ledgers:
+            stack.callback(ledger.close)
         reading = read_robot(
-            end.chain, end.contract, robot, roots=end.roots, reader=end.identity,
-            from_block=end.from_block if from_block is None else from_block,
+            ledgers, robot, trust=Trust(roots), reader=identity.encryption_key, now=time.time(), bookmarks=bookmarks
         )
-    finally:
-        end.chain.close()
-    chosen = choice.choose(reading.proven.records)
-    records = [record.proven for record in chosen]
-    if bag is not None:
-        written = outputs.write_bag(bag, records)
-        talk(f"{bag}: {written.whole} messages whole, {written.partial} in part, {written.as_json} as JSON")
-    drawn = plot is not None and bool(outputs.positions(records))
-    if plot is not None and drawn:
-        outputs.draw_trajectory(plot, records)
-    if bag is None and plot is None and not json:
-        for record in records:
-            sys.stdout.write(outputs.json_line(record))
-    findings = [str(problem) for problem in reading.history.problems] + [str(f) for f in reading.proven.findings]
+        sinks = [stack.enter_context(outputs.bag(bag)).write] if bag is not None else []
+        if csv is not None:
+            sinks.append(stack.enter_context(outputs.table(csv)).write)
+        if trajectory is not None:
+            sinks.append(trajectory.write)
+        if not sinks and not json:
+            sinks.append(lambda record: sys.stdout.write(outputs.json_line(record)) and None)
+        for record in choice.choose(_noting(reading.records(), topics)):
+            chosen += 1
+            for sink in sinks:
+                sink(record)
+        verdict = reading.verdict()
+    reading.keep(bookmarks, confirm=confirm)
     if json:
-        print_json(_summary(reading, findings, [outputs.as_json(record) for record in records]))
-    for finding in findings:
-        talk(finding)
-    talk(f"{robot}: {len(reading.proven.records)} records proven, {len(chosen)} chosen; " + _verdict(reading))
-    if topic is not None and not any(record.captured.topic == topic for record in chosen):
-        topics = sorted({record.captured.topic for record in Choice().choose(reading.proven.records)})
-        if topic not in topics:
-            talk(f"nothing was read on {topic}; what was read is on: {', '.join(topics) or 'no topic'}")
-    if not reading.sound:
+        print_json(verdict.as_json() | {"chosen": chosen})
+    for line in verdict.lines():
+        talk(line)
+    if topic is not None and chosen == 0 and topic not in topics:
+        talk(f"nothing was read on {topic}; what was read is on: {', '.join(sorted(topics)) or 'no topic'}")
+    if not verdict.sound:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
-    if plot is not None and not drawn:
-        raise ConfigError(f"{plot} is not drawn: none of the {len(records)} chosen records holds a position")
+    if plot is not None and trajectory is not None and not trajectory.draw(plot):
+        raise ConfigError(f"{plot} is not drawn: none of the {chosen} chosen records holds a position")
 
 
-def _verdict(reading: Reading) -> str:
-    if not reading.sound:
-        return "NOT SOUND"
-    return "complete" if reading.complete else ", ".join(["sound", *reading.open_ends])
-
-
-def _summary(reading: Reading, findings: list[str], records: list[Any]) -> dict[str, Any]:
-    return {
-        "robot": reading.robot, "sound": reading.sound, "complete": reading.complete, "open": reading.open_ends,
-        "from_block": reading.history.from_block, "to_block": reading.history.to_block,
-        "proven": len(reading.proven.records), "findings": findings, "records": records,
-    }
+def _noting(records: Iterator[ProvenRecord], topics: set[str]) -> Iterator[ProvenRecord]:
+    for record in records:
+        topics.add(record.content.topic)
+        yield record

@@ -1,0 +1,76 @@
+"""How the commands meet a person: the options they share, one console for talk (stderr), one for data (stdout)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rosbridge_eth.logs import LogFormat, speaks_json
+
+log = logging.getLogger(__name__)
+
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+data = Console(highlight=False)
+
+OPERATOR_HOME, ROBOT_HOME, READER_HOME = Path("operator"), Path("robot"), Path("reader")
+
+OperatorHomeOption: TypeAlias = Annotated[
+    Path, typer.Option("--home", help="The operator's folder.", envvar="ROSBRIDGE_ETH_HOME", show_default=True)
+]
+RobotHomeOption: TypeAlias = Annotated[
+    Path, typer.Option("--home", help="The robot's folder.", envvar="ROSBRIDGE_ETH_ROBOT_HOME", show_default=True)
+]
+ReaderHomeOption: TypeAlias = Annotated[
+    Path, typer.Option("--home", help="The reader's folder.", envvar="ROSBRIDGE_ETH_READER_HOME", show_default=True)
+]
+AnyHomeOption: TypeAlias = Annotated[
+    Path, typer.Option("--home", help="An operator's, a robot's or a reader's folder.", envvar="ROSBRIDGE_ETH_HOME")
+]
+PassphraseFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("--passphrase-file", help="Read the passphrase from the first line of this file, and do not ask."),
+]
+PasswordFile: TypeAlias = Annotated[
+    Path | None, typer.Option("--password-file", help="Read the robot's password from the first line of this file.")
+]
+Verbose: TypeAlias = Annotated[
+    int, typer.Option("--verbose", "-v", count=True, help="Log what happens on stderr; twice (-vv): every chunk.")
+]
+LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option("--log-format", help="How a line of the log looks.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+def utc_now() -> datetime:
+    return datetime.now(UTC)
+
+
+def talk(text: str) -> None:
+    """A line for the person at the terminal; never parsed as markup. An event, where stderr carries JSON."""
+    if speaks_json():
+        log.warning("%s", text)
+        return
+    errors.print(text, markup=False)
+
+
+def print_json(value: Any) -> None:
+    """One JSON value on stdout, for programs."""
+    sys.stdout.write(json.dumps(value, ensure_ascii=False) + "\n")
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[int] = ()) -> Table:
+    """A table whose cells are plain text; `right` are the columns aligned to the right."""
+    made = Table(title=title, title_justify="left", header_style="bold")
+    for index, column in enumerate(columns):
+        made.add_column(column, justify="right" if index in right else "left", overflow="fold")
+    for row in rows:
+        made.add_row(*(str(cell).replace("[", r"\[") for cell in row))
+    return made
