@@ -23,9 +23,9 @@ from smcrypto import sm2
 
 _LOG = chunks.Log(b"l" * 32, b"t" * 32)
 KEY = sm2.PrivateKey.from_int(1000)
-PLACE = chunks.seal(
-    _LOG, KEY, [], stream=bytes(16), number=0, previous=bytes(32), sealed_ms=0, readers=[]
-).header  # fmt: skip
+HEADER = chunks.seal(
+    _LOG, KEY, [b"one", b"two"], stream=bytes(16), number=0, previous=bytes(32), sealed_ms=0, readers=[KEY.public_key]
+).header
 
 
 def _require(holds: bool, what: str) -> None:
@@ -50,8 +50,8 @@ def _chunk(data: bytes) -> None:
 
 
 def _plaintext(data: bytes) -> None:
-    lines = chunks._unpack(PLACE, data)
-    _require(0 < len(lines) <= chunks.MAX_RECORDS and all(lines), "records")
+    lines = chunks._unpack(HEADER, data)
+    _require(len(lines) == HEADER.records and all(lines), "records")
     _require(sum(map(len, lines)) < chunks.MAX_PLAINTEXT and not any(b"\n" in line for line in lines), "lines")
 
 

@@ -219,19 +219,9 @@ class Chunk:
 
 
 def seal(
-    log: Log,
-    key: sm2.PrivateKey,
-    lines: Sequence[bytes],
-    *,
-    stream: bytes,
-    number: int,
-    previous: bytes,
-    sealed_ms: int,
-    readers: Sequence[sm2.PublicKey],
-    goodbye: bool = False,
-    compress: bool = True,
-    level: int = LEVEL,
-    randomness: Randomness = secrets.token_bytes,
+    log: Log, key: sm2.PrivateKey, lines: Sequence[bytes], *,
+    stream: bytes, number: int, previous: bytes, sealed_ms: int, readers: Sequence[sm2.PublicKey],
+    goodbye: bool = False, compress: bool = True, level: int = LEVEL, randomness: Randomness = secrets.token_bytes,
 ) -> Chunk:
     """The chunk that holds `lines`, signed with the robot's `key` and encrypted to `readers` (1 to 16).
 
@@ -349,8 +339,6 @@ def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:
     except InvalidTag:
         raise Unopenable(f"{header} does not open with this key") from None
     lines = _unpack(header, plaintext)
-    if len(lines) != header.records:
-        raise Unopenable(f"{header} holds {len(lines)} records and not {header.records}")
     if _levels(_leaves(lines, key))[-1][0] != header.root:
         raise Unopenable(f"the records of {header} are not those that its root commits to")
     return lines
@@ -372,8 +360,8 @@ def _unpack(header: Header, plaintext: bytes) -> tuple[bytes, ...]:
         raise Unopenable(f"{header} holds more than one frame and its padding")
     if not content.endswith(b"\n") or content.startswith(b"\n") or b"\n\n" in content:
         raise Unopenable(f"{header} holds a record that is empty or has no end")
-    if content.count(b"\n") > MAX_RECORDS:
-        raise Unopenable(f"{header} holds more than {MAX_RECORDS} records")
+    if (count := content.count(b"\n")) != header.records:
+        raise Unopenable(f"{header} holds {count} records and not {header.records}")
     return tuple(content[:-1].split(b"\n"))
 
 

@@ -36,18 +36,9 @@ class LogWriter:
     """
 
     def __init__(
-        self,
-        log: Log,
-        key: sm2.PrivateKey,
-        readers: Sequence[sm2.PublicKey],
-        *,
-        previous: bytes,
-        stream_line: bytes,
-        period: float = 1.0,
-        heartbeat: float = 3600.0,
-        compress: bool = True,
-        now: float,
-        randomness: Randomness = secrets.token_bytes,
+        self, log: Log, key: sm2.PrivateKey, readers: Sequence[sm2.PublicKey], *,
+        previous: bytes, stream_line: bytes, period: float = 1.0, heartbeat: float = 3600.0, compress: bool = True,
+        now: float, randomness: Randomness = secrets.token_bytes,
     ) -> None:
         if period <= 0 or heartbeat <= 0:
             raise ValueError(f"period and heartbeat are above 0, not {period} and {heartbeat}")
@@ -72,12 +63,8 @@ class LogWriter:
         self._begun = self._now
 
     def add(
-        self,
-        line: bytes,
-        now: float,
-        *,
-        type_name: str | None = None,
-        definition_line: Callable[[], bytes] | None = None,
+        self, line: bytes, now: float, *,
+        type_name: str | None = None, definition_line: Callable[[], bytes] | None = None,
     ) -> None:
         """Take one line in. Call `closed` afterwards, or when `next_timer` says.
 

@@ -249,11 +249,13 @@ def test_a_chunk_without_records_has_nothing_else(changes):
         Header.parse(header_bytes(EMPTY.header, n=1) + grant)
 
 
-def test_sixteen_grants_are_a_header_and_seventeen_are_not():
+def test_one_to_sixteen_grants_are_a_header_and_others_are_not():
     grant = CHUNK.header.encoded[-121:]
     assert len(Header.parse(header_bytes(CHUNK.header, n=16) + 15 * grant).grants) == 16
     with pytest.raises(Malformed):
         Header.parse(header_bytes(CHUNK.header, n=17) + 16 * grant)
+    with pytest.raises(Malformed):
+        Header.parse(header_bytes(CHUNK.header, n=0)[:139])
 
 
 # A robot that lies: the signature holds, the content does not
@@ -268,27 +270,41 @@ def streamed(content: bytes, window_log: int) -> bytes:
     return packing.compress(content) + packing.flush()
 
 
+def unended(content: bytes) -> bytes:
+    """All blocks of a frame but the last; the zeros behind it are empty blocks."""
+    packing = zstd.ZstdCompressor()
+    return packing.compress(content, packing.FLUSH_BLOCK)
+
+
 @pytest.mark.parametrize(
-    "what",
+    ("why", "what"),
     [
-        {"frame": b""}, {"frame": b"a\n"}, {"frame": FRAME[:-1] + b"\xff"}, {"frame": FRAME[:-3]},
-        {"frame": FRAME + FRAME}, {"frame": FRAME + b"\0\0\1"}, {"frame": FRAME + SKIPPABLE},
-        {"frame": SKIPPABLE + FRAME}, {"frame": SKIPPABLE}, {"frame": FRAME, "pad": 64 - len(FRAME) + 64},
-        {"frame": streamed(b"a\n" * 10, 23)},
-        {"frame": zstd.compress(b"\n")}, {"frame": zstd.compress(b"")}, {"frame": zstd.compress(b"a")},
-        {"frame": zstd.compress(b"\na\n")}, {"frame": zstd.compress(b"a\n\n")},
-        {"frame": zstd.compress(b"a\n\nb\n"), "records": 2},
-        {"frame": zstd.compress(b"a\n" * (MAX_RECORDS + 1)), "records": MAX_RECORDS},
-        {"frame": zstd.compress(b"a\nb\n"), "records": 1}, {"frame": FRAME, "records": 2},
-        {"frame": FRAME, "root": root_of([b"b"])}, {"frame": FRAME, "root": root_of([b"a"], b"j" * 16)},
-        {"frame": FRAME, "sealed_under": b"j" * 16},
+        ("no zstd frame", {"frame": b"a\n"}), ("no zstd frame", {"frame": b"", "pad": 64}),
+        ("no zstd frame", {"frame": SKIPPABLE + FRAME}), ("no zstd frame", {"frame": SKIPPABLE}),
+        ("no zstd frame", {"frame": b"\x27\xb5\x2f\xfd" + FRAME[4:]}),
+        ("cannot be unpacked", {"frame": FRAME[:5] + b"\xff" * 20}),
+        ("cannot be unpacked", {"frame": streamed(b"a\n", 23)}),
+        ("no end", {"frame": unended(b"a\n")}),
+        ("more than one frame", {"frame": FRAME + FRAME}), ("more than one frame", {"frame": FRAME + SKIPPABLE}),
+        ("more than one frame", {"frame": FRAME + b"\0\0\1"}),
+        ("more than one frame", {"frame": FRAME, "pad": 128 - len(FRAME)}),
+        ("empty or has no end", {"frame": zstd.compress(b""), "records": 1}),
+        ("empty or has no end", {"frame": zstd.compress(b"a")}),
+        ("empty or has no end", {"frame": zstd.compress(b"\n"), "root": root_of([b""])}),
+        ("empty or has no end", {"frame": zstd.compress(b"\na\n"), "root": root_of([b"", b"a"]), "records": 2}),
+        ("empty or has no end", {"frame": zstd.compress(b"a\n\n"), "root": root_of([b"a", b""]), "records": 2}),
+        ("holds 1001 records", {"frame": zstd.compress(b"a\n" * (MAX_RECORDS + 1)), "records": MAX_RECORDS}),
+        ("holds 2 records", {"frame": zstd.compress(b"a\nb\n")}), ("holds 1 records", {"frame": FRAME, "records": 2}),
+        ("root", {"frame": FRAME, "root": root_of([b"b"])}),
+        ("root", {"frame": FRAME, "root": root_of([b"a"], b"j" * 16)}),
+        ("does not open", {"frame": FRAME, "sealed_under": b"j" * 16}),
     ],
-    ids=lambda what: str(what)[:60],
+    ids=str,
 )  # fmt: skip
-def test_what_the_robot_signed_and_cannot_be_opened_is_unopenable(what):
-    chunk = lying(**{"root": root_of([b"a"])} | what) if what["frame"] else lying(b"", pad=64)
+def test_what_the_robot_signed_and_cannot_be_opened_is_unopenable(why, what):
+    chunk = lying(**{"root": root_of([b"a"])} | what)
     verify(LOG, ROBOT.public_key, chunk)
-    with pytest.raises(Unopenable):
+    with pytest.raises(Unopenable, match=why):
         opened(chunk)
 
 
