@@ -168,8 +168,11 @@ class Database:
         """Whether the reserve is there, or could be made."""
         if self._reserve.exists():
             return True
+        size, room = 2 * self._wal_pages * _PAGE, os.statvfs(self.path.parent)
+        if room.f_bavail * room.f_frsize < size:
+            return False
         try:
-            self._reserve.write_bytes(os.urandom(2 * self._wal_pages * _PAGE))  # what no file system compresses
+            self._reserve.write_bytes(os.urandom(size))  # what no file system compresses
         except OSError:
             self._reserve.unlink(missing_ok=True)
             return False

@@ -5,7 +5,7 @@ spool is at its bound, or its disk is full, there is room for what is new at the
 
     1. chunks that the server has stored, and those set aside, as a whole
     2. bodies of the oldest other ones; the robot signs that form of the chunk, and it is still sent
-    3. headers of the oldest without body: they take at most an eighth of the bound; the links of the log show it
+    3. headers of the oldest without body: they take at most an eighth of the room; the links of the log show it
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ _STORED, _ASIDE, _BARE, _WHOLE = 2, 3, 4, 5
 
 All take one byte in SQLite's format (0 and 1 take none), so that a change of state does not move the body.
 """
-_BARE_SHARE: Final = 8  # of the bound, for chunks without body
+_BARE_SHARE: Final = 8  # of what is there, for chunks without body
 _SPARE: Final = 64 * 1024  # bytes removed beyond a chunk's own on a full disk, where pages count and not bytes
+_FEW: Final = 32  # rows
 
 _SCHEMA: Final = """
 -- position: the order of the log. number: 8 bytes, big-endian, which order as they count. chunk: as it travels.
@@ -128,13 +129,14 @@ class Spool:
     def _append(self, chunk: Chunk, size: int, *, spare: int) -> None:
         held = self._bytes()
         self._shrink(min(self._max_bytes - size, held - spare))
-        header, encoded = chunk.header, chunk.encoded
-        self._db.run(
-            "INSERT INTO chunk (stream, number, digest, records, size, state, chunk) VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (header.stream, _sortable(header.number), header.digest, header.records, size,
-             _WHOLE if chunk.body else _BARE, encoded),
-        )  # fmt: skip
-        self._db.run("UPDATE spool SET last = ?", (header.digest,))
+        self._insert(None, chunk)
+        self._db.run("UPDATE spool SET last = ?", (chunk.header.digest,))
+
+    def _insert(self, position: int | None, chunk: Chunk) -> None:
+        header, encoded, state = chunk.header, chunk.encoded, _WHOLE if chunk.body else _BARE
+        place = (position, header.stream, _sortable(header.number), header.digest)
+        row = (*place, header.records, len(encoded), state, encoded)
+        self._db.run("INSERT INTO chunk VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
 
     def _bytes(self, *states: int) -> int:
         held = self._db.run("SELECT state, bytes FROM held").fetchall()
@@ -143,7 +145,7 @@ class Spool:
     def _shrink(self, limit: int) -> None:
         """Remove until no more than `limit` bytes are left, in the order that the module's docstring gives."""
         while self._bytes() > max(0, limit):
-            many = self._bytes(_BARE) > self._max_bytes // _BARE_SHARE
+            many = self._bytes(_BARE) > self._bytes() // _BARE_SHARE
             for state in (_STORED, _ASIDE, _BARE, _WHOLE) if many else (_STORED, _ASIDE, _WHOLE, _BARE):
                 row = self._db.one(_OLDEST, (state,))
                 if row is not None:
@@ -151,14 +153,9 @@ class Spool:
                     break
 
     def _remove(self, state: int, position: int, records: int, encoded: bytes) -> None:
-        if state == _WHOLE:
-            dropped = self._drop(Chunk.parse(encoded)).encoded
-            self._db.run(
-                "UPDATE chunk SET state = ?, size = ?, chunk = ? WHERE position = ?",
-                (_BARE, len(dropped), dropped, position),
-            )
-        else:
-            self._db.run("DELETE FROM chunk WHERE position = ?", (position,))
+        self._db.run("DELETE FROM chunk WHERE position = ?", (position,))
+        if state == _WHOLE:  # put back: an UPDATE would leave it a page of its own
+            self._insert(position, self._drop(Chunk.parse(encoded)))
         if state != _STORED:
             bodies = int(state != _BARE)
             self._db.run(
@@ -202,33 +199,26 @@ class Spool:
 
     def stored(self, stream: bytes, number: int) -> None:
         """The server has everything of this stream up to this number."""
-        upto = (stream, _sortable(number))
-        self._db.write(
-            lambda: self._db.run(
-                f"UPDATE chunk SET state = ? WHERE state IN (?, ?) AND stream = ? AND position <= {_UP_TO}",  # noqa: S608
-                (_STORED, _BARE, _WHOLE, stream, *upto),
-            ),
-            durable=False,
-        )
+        where = f"state IN (?, ?) AND stream = ? AND position <= {_UP_TO}"
+        self._change("UPDATE chunk SET state = ?", where, _STORED, _BARE, _WHOLE, stream, stream, _sortable(number))
 
     def confirmed(self, stream: bytes, number: int) -> None:
         """This chunk and everything before it in the log leave the spool; what is set aside stays."""
-        self._db.write(
-            lambda: self._db.run(
-                f"DELETE FROM chunk WHERE state != ? AND position <= {_UP_TO}",  # noqa: S608
-                (_ASIDE, stream, _sortable(number)),
-            ),
-            durable=False,
-        )
+        self._change("DELETE FROM chunk", f"state != ? AND position <= {_UP_TO}", _ASIDE, stream, _sortable(number))
 
     def set_aside(self, stream: bytes, number: int) -> int:
         """The server will never take this stream from this number on: it is not sent again. Returns how many."""
-        return self._db.write(
-            lambda: self._db.run(
-                "UPDATE chunk SET state = ? WHERE stream = ? AND number >= ? AND state != ?",
-                (_ASIDE, stream, _sortable(number), _ASIDE),
-            ).rowcount
-        )
+        where = "state != ? AND stream = ? AND number >= ?"
+        return self._change("UPDATE chunk SET state = ?", where, _ASIDE, _ASIDE, stream, _sortable(number))
+
+    def _change(self, statement: str, where: str, *values: bytes | int) -> int:
+        """Without an fsync: the server says it again. Few rows at a time, which takes little room on a full disk."""
+        few = f"{statement} WHERE position IN (SELECT position FROM chunk WHERE {where} LIMIT {_FEW})"  # noqa: S608
+        count = changed = self._db.write(lambda: self._db.run(few, values).rowcount, durable=False)
+        while changed == _FEW:
+            changed = self._db.write(lambda: self._db.run(few, values).rowcount, durable=False)
+            count += changed
+        return count
 
     def statistics(self) -> SpoolStatistics:
         """What is in the spool at this moment."""
