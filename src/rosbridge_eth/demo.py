@@ -1,78 +1,61 @@
-"""The main job in one process: a bag through real UDP onto an EVM and back, every record proven and compared.
+"""`demo`: the main job in one process: a bag through real UDP onto an EVM and back, every record proven and compared.
 
-Operator, server and robot are the same parts that run apart otherwise, on the
-embedded chain; only the processes are threads. What comes back is compared
-with the bag's messages, field by field, not with what was sent.
+Operator, server, robot and reader are the same parts that run apart otherwise, on the embedded chain; only the
+processes are threads. What comes back is compared with the bag's messages, field by field, not with what was sent.
 """
 
 from __future__ import annotations
 
 import secrets
+import tempfile
 import threading
 import time
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from html import escape
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Annotated
 
-from rosbridge_eth.bundle import open_bundle
-from rosbridge_eth.capture import CapturedRecord
-from rosbridge_eth.channel.udp import server_sockets
-from rosbridge_eth.config import load_robot_config, load_server_config
-from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.home import OperatorHome, RobotHome
-from rosbridge_eth.identity import load_identity
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.embedded import EmbeddedChain
-from rosbridge_eth.ledger.submitter import BatchTiming
-from rosbridge_eth.reader import Choice, Reading, ReadRecord, read_robot
-from rosbridge_eth.registry import OWNER, Registry
-from rosbridge_eth.relay import Harm, Relay
-from rosbridge_eth.robot import assembly as robot_assembly
-from rosbridge_eth.robot.process import Robot
-from rosbridge_eth.server.administration import (
-    deploy_contract,
-    init_home,
-    load_ca,
-    load_server_identity,
-    register_robot,
-    server_trust,
-)
-from rosbridge_eth.server.assembly import bound_contract, open_inbox, open_journal, open_submission, open_worker
-from rosbridge_eth.server.submission import Submission
-from rosbridge_eth.server.worker import Worker
-from rosbridge_eth.sources import BagSettings, Selection, open_source
+import typer
+
+from rosbridge_eth.errors import BridgeError, VerificationError
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger import DataEvent, Ledger
+    from rosbridge_eth.ledger.submitter import Submitter
+    from rosbridge_eth.reading import ProvenRecord, Verdict
+    from rosbridge_eth.reading.compare import Comparison
+    from rosbridge_eth.relay import Harm
+    from rosbridge_eth.robot import Robot
+    from rosbridge_eth.server import Worker
 
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
-SETTLE = 60.0  # seconds for the last batch to be confirmed
+SETTLE = 60.0  # seconds for the last chunk to be confirmed
 
 
 @dataclass(slots=True)
 class Stages:
-    """How many records reached each stage, and how long each took (seconds).
-
-    From `sent` on, the stream's own records count too: one that opens it, one that ends it.
-    """
+    """How many records reached each stage, and how long each took (seconds)."""
 
     captured: int = 0
-    sent: int = 0
-    retransmitted: int = 0
+    chunks: int = 0
     stored: int = 0
-    included: int = 0
     verified: int = 0
     times: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
-    """What the bag says against what came back: `equal` records, and a sentence for each that is not."""
+class Transaction:
+    """A batch on the chain."""
 
-    equal: int
-    differences: tuple[str, ...]
+    block: int
+    chunks: int
+    bytes: int
+    gas: int
+    hash: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,18 +63,21 @@ class DemoResult:
     """Everything the report shows."""
 
     stages: Stages
-    batches: tuple[BatchTiming, ...]
-    reading: Reading
-    records: tuple[ReadRecord, ...]
+    transactions: tuple[Transaction, ...]
+    verdict: Verdict
+    records: tuple[ProvenRecord, ...]
     comparison: Comparison
     contract: str
     seconds: float
 
     @property
     def passed(self) -> bool:
-        """Every captured record came back, proven, equal to the bag's, once."""
+        """Every captured record came back, proven, equal to the bag's, once, and the robot has said goodbye."""
+        head = self.verdict.head
         return (
-            self.reading.complete
+            self.verdict.sound
+            and head is not None
+            and head.goodbye
             and not self.comparison.differences
             and self.stages.captured == self.comparison.equal == len(self.records) > 0
         )
@@ -102,21 +88,27 @@ class _Server:
     """The server's parts, in two threads."""
 
     worker: Worker
-    submission: Submission
-    timings: list[BatchTiming]
+    submitter: Submitter
     stop: threading.Event = field(default_factory=threading.Event)
     failures: list[BaseException] = field(default_factory=list)
     threads: list[threading.Thread] = field(default_factory=list)
 
     def start(self) -> None:
-        for name, task in (("worker", self.worker.run), ("submitter", self.submission.run)):
+        for name, task in (("worker", self._receive), ("submitter", self._submit)):
             thread = threading.Thread(target=self._run, args=(task,), name=name, daemon=True)
             self.threads.append(thread)
             thread.start()
 
-    def _run(self, task: Callable[[Callable[[], bool]], None]) -> None:
+    def _receive(self) -> None:
+        self.worker.run(self.stop.is_set)
+
+    def _submit(self) -> None:
+        while not self.stop.wait(min(0.05, self.submitter.turn(time.time()))):
+            continue
+
+    def _run(self, task: Callable[[], None]) -> None:
         try:
-            task(self.stop.is_set)
+            task()
         except BaseException as error:  # kept and raised in the main thread, which waits for this one
             self.failures.append(error)
             self.stop.set()
@@ -141,190 +133,272 @@ def run_demo(
     on_datagram: Callable[[bytes], None] = lambda data: None,
     on_stage: Callable[[str], None] = lambda text: None,
     on_progress: Callable[[Stages], None] = lambda stages: None,
+    on_turn: Callable[[Robot], None] = lambda robot: None,
 ) -> DemoResult:
     """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
 
-    harm: what the network between robot and server does to datagrams; nothing by default.
-    on_datagram: is shown each of them.
+    harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each
+    of them. on_turn: is given the robot at each turn of its loop.
     """
-    started = time.monotonic()
-    stages = Stages()
-    home, robot_home = OperatorHome(folder / "operator"), RobotHome(folder / "robot")
-    passphrase, password = secrets.token_hex(16).encode(), secrets.token_hex(16).encode()
+    from rosbridge_eth import administration
+    from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
+    from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+    from rosbridge_eth.config import load_robot_config, load_server_config
+    from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+    from rosbridge_eth.identity import Trust, load_ca, load_identity
+    from rosbridge_eth.ledger import Keyring, Ledger
+    from rosbridge_eth.ledger.nodes import EmbeddedChain
+    from rosbridge_eth.reading import read_robot
+    from rosbridge_eth.reading.compare import compare
+    from rosbridge_eth.registry import Registry
+    from rosbridge_eth.relay import Harm, Relay
+    from rosbridge_eth.robot import open_robot
+    from rosbridge_eth.server import Worker
+    from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
+
+    started, stages = time.monotonic(), Stages()
+    home, robot_home, reader_home = (
+        OperatorHome(folder / "operator"), RobotHome(folder / "robot"), ReaderHome(folder / "reader")
+    )  # fmt: skip
+    passphrase, password, reader_passphrase = (secrets.token_hex(16).encode() for _ in range(3))
     now = datetime.now(UTC)
 
     on_stage("making keys and certificates")
     with _timed(stages, "keys and certificates"):
-        init_home(home, passphrase, listen="127.0.0.1:0", public=None, chain_url="embedded", server="server", now=now)
+        administration.init_home(
+            home, passphrase, reader=reader_home, reader_passphrase=reader_passphrase, now=now, listen="127.0.0.1:0",
+            public="127.0.0.1:7410",
+        )
         keys = Keyring.load(home.accounts, passphrase)
+        ask_to_join(robot_home, ROBOT, password)
 
     on_stage("starting the embedded chain, deploying the contract")
     with _timed(stages, "chain and contract"):
         chain = EmbeddedChain(fund={keys.operator.address: FUNDS})
-        deployment = deploy_contract(home, chain, keys)
-        contract = bound_contract(chain, deployment)
+        deployment = administration.deploy_contract(home, chain, keys)
+        ledger = Ledger.connect(chain, deployment)
 
     on_stage("registering the robot")
+    config, registry = load_server_config(home.config), Registry(home.registry)
     with _timed(stages, "registration"):
-        made = register_robot(
-            home, ROBOT, ca=load_ca(home, passphrase), keys=keys, chain=chain, password=password, now=now
+        made = administration.register_robot(
+            home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
+            inbox=lambda: open_store(config, home), request=Request.decode(robot_home.request.read_bytes()),
         )
-        robot_assembly.join(robot_home, open_bundle(made.bundle.read_bytes(), password), password)
+        join(robot_home, read_bundle(made.bundle.read_bytes()))
 
-    config = load_server_config(home.config)
     [sock] = server_sockets(config.listen)
-    registry, journal = Registry(home.registry), open_journal(home, deployment)
-    timings: list[BatchTiming] = []
-    server = _Server(
-        open_worker(
-            0, sock, config=config, identity=load_server_identity(home, passphrase),
-            trust=server_trust(home, registry), registry=registry, inbox=open_inbox(config, home), journal=journal,
-            deployment=deployment,
-        ),
-        open_submission(
-            config=config, contract=contract, journal=journal, inbox=open_inbox(config, home), registry=registry,
-            keys=keys, on_confirmed=timings.append,
-        ),
-        timings,
+    inbox = open_store(config, home)
+    reception = open_reception(
+        0, config, administration.load_server_identity(home, passphrase), home, registry, inbox, deployment
     )
+    submitter = open_submitter(config, ledger, open_store(config, home), registry, keys)
+    server = _Server(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
     relay = Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)
     robot_home.config.write_text(robot_toml(topics, bag, relay.port))
-    robot = robot_assembly.open_robot(robot_home, load_robot_config(robot_home.config), password)
+    robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
+
+    def progress() -> None:
+        server.check()
+        stages.captured, stages.chunks = robot.captured, robot.chunks
+        stages.stored = reception.records[ROBOT]
+        on_progress(stages)
+        on_turn(robot)
 
     on_stage("replaying the bag over UDP")
     server.start()
     try:
         with _timed(stages, "replay and delivery"):
-            robot.run(on_turn=lambda: _progress(robot, server, stages, on_progress))
-            _progress(robot, server, stages, on_progress)
+            robot.run(on_turn=progress)
+        progress()
         on_stage("waiting for the last block")
         with _timed(stages, "last batches"):
-            _settle(server, stages, on_progress)
+            deadline = time.monotonic() + SETTLE
+            while any(waiting.chunks for waiting in inbox.totals().values()):
+                server.check()
+                if time.monotonic() > deadline:
+                    raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
+                server.stop.wait(0.02)
     finally:
         server.end()
         relay.close()
     server.check()
-    _costs(robot, server, stages)
 
     on_stage("reading everything back from the chain")
     with _timed(stages, "fetch, open and verify"):
-        reader, roots = load_identity(home.reader(OWNER), passphrase)
-        reading = read_robot(chain, deployment.contract, ROBOT, roots=roots, reader=reader)
-        records = Choice().choose(reading.proven.records)
+        reader, roots = load_identity(reader_home.path, reader_passphrase)
+        reading = read_robot([ledger], ROBOT, trust=Trust(roots), reader=reader.encryption_key, now=time.time())
+        records = tuple(reading.records())
+        verdict = reading.verdict()
     on_stage("comparing with the bag")
     with _timed(stages, "comparison with the bag"):
-        comparison = compare(bag, topics, [record.captured for record in records])
+        comparison = compare(bag, topics, [record.content for record in records])
     stages.verified = comparison.equal
     on_progress(stages)
+    tk = reading.verifier.log.tk
+    events = ledger.data_events(tk, 0, ledger.block_number())
     return DemoResult(
-        stages, tuple(server.timings), reading, tuple(records), comparison, deployment.contract,
+        stages, tuple(_transactions(ledger, events)), verdict, records, comparison, deployment.contract,
         time.monotonic() - started,
     )
 
 
 def robot_toml(topics: Sequence[str], bag: Path, port: int) -> str:
+    """The configuration of the demo's robot; its chunks are short, so that there are several."""
     names = ", ".join(f'"{topic}"' for topic in topics)
     return (
-        f'topics = [{names}]\nserver = "127.0.0.1:{port}"\n\n'
+        f'topics = [{names}]\nserver = "127.0.0.1:{port}"\n\n[log]\nperiod = "50ms"\n\n'
         f'[source]\nkind = "bag"\npath = "{bag.resolve()}"\nspeed = "max"\n'
     )
 
 
-class _timed:
-    """Adds the seconds of a block to the stages' times."""
-
-    def __init__(self, stages: Stages, name: str) -> None:
-        self._times, self._name = stages.times, name
-
-    def __enter__(self) -> None:
-        self._started = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._times[self._name] = time.perf_counter() - self._started
-
-
-def _progress(robot: Robot, server: _Server, stages: Stages, on_progress: Callable[[Stages], None]) -> None:
-    server.check()
-    stages.captured = robot.recorder.times.records
-    stages.sent = robot.sender.statistics.sent
-    stages.retransmitted = robot.client.statistics().frames_retransmitted
-    stages.stored = robot.sender.statistics.stored
-    stages.included = sum(timing.records for timing in server.timings)
-    on_progress(stages)
-
-
-def _settle(server: _Server, stages: Stages, on_progress: Callable[[Stages], None]) -> None:
-    """Wait until everything stored is confirmed."""
-    deadline = time.monotonic() + SETTLE
-    while stages.included < stages.stored:
-        server.check()
-        if time.monotonic() > deadline:
-            raise BridgeError(f"{stages.stored - stages.included} records are in no block after {SETTLE:.0f} s")
-        server.stop.wait(0.02)
-        stages.included = sum(timing.records for timing in server.timings)
-        on_progress(stages)
-
-
-def _costs(robot: Robot, server: _Server, stages: Stages) -> None:
-    """The cost of a message on the robot, stage by stage, and the latencies of the batches."""
-    times = robot.recorder.times
-    for name, total in (("capture", times.capture), ("seal", times.seal), ("spool", times.spool)):
-        stages.times[f"{name}, per record"] = total / max(1, times.records)
-    batches = server.timings
-    for name in ("submit", "include", "confirm"):
-        stages.times[f"{name}, per batch"] = median(getattr(batch, name) for batch in batches) if batches else 0.0
-
-
-def compare(bag: Path, topics: Sequence[str], records: Sequence[CapturedRecord]) -> Comparison:
-    """Hold each record against the bag's own message: the same receive time, and each captured field equal.
-
-    Both sides are taken in order per topic, so a record that is missing,
-    doubled or out of its place is a difference.
-    """
-    expected: dict[str, list[tuple[int, Any]]] = defaultdict(list)
-    source = open_source(BagSettings(bag, speed=None), Selection(topics))
-    try:
-        source.run(
-            lambda raw: expected[raw.topic].append((raw.received_ns, raw.decoder.decode(raw.raw))), threading.Event()
+def _transactions(ledger: Ledger, events: Iterable[DataEvent]) -> Iterator[Transaction]:
+    for event in events:
+        receipt = ledger.receipt(event.transaction)
+        yield Transaction(
+            event.block, len(event.chunks), sum(map(len, event.chunks)), 0 if receipt is None else receipt.gas_used,
+            "0x" + event.transaction.hex(),
         )
+
+
+@contextmanager
+def _timed(stages: Stages, name: str) -> Iterator[None]:
+    """Adds the seconds of a block to the stages' times."""
+    started = time.perf_counter()
+    yield
+    stages.times[name] = time.perf_counter() - started
+
+
+# The command
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth demo --report demo-report")(demo)
+
+
+def demo(
+    report: Annotated[Path, typer.Option(help="Folder for the report; made if absent.")] = Path("demo-report"),
+    bag: Annotated[Path | None, typer.Option(help="A bag of your own; without it, the sample.")] = None,
+    topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
+    loss: Annotated[
+        float, typer.Option(min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")
+    ] = 0.0,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
+) -> None:
+    """Replay a real bag over real UDP onto an Ethereum chain in this process, read it back, prove and compare it.
+
+    Exits with 9 if a single record is missing, altered or doubled.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from rosbridge_eth.cli.terminal import data, errors, print_json, table, talk
+    from rosbridge_eth.logs import log_to_stderr
+    from rosbridge_eth.reading import outputs
+    from rosbridge_eth.relay import Harm
+    from rosbridge_eth.sources.bag import sample_bag
+
+    log_to_stderr()
+    report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
+    chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
+    columns = (TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with ExitStack() as stack:
+        progress = stack.enter_context(Progress(*columns, console=errors))
+        home = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosbridge-eth-"))
+        total = _expected(chosen, topics)
+        bars = {name: progress.add_task(name, total=total) for name in ("captured", "stored", "verified")}
+
+        def show(stages: Stages) -> None:
+            for name, bar in bars.items():
+                progress.update(bar, completed=getattr(stages, name))
+
+        result = run_demo(
+            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
+            on_stage=lambda text: progress.console.print(f"· {text}"), on_progress=show,
+        )
+    (report / "records.jsonl").write_text("".join(map(outputs.json_line, result.records)), encoding="utf-8")
+    trajectory = outputs.Trajectory()
+    for record in result.records:
+        trajectory.write(record)
+    drawn = trajectory.draw(report / "trajectory.png") > 0
+    stages = result.stages
+    counts = [
+        ("records captured", stages.captured), ("chunks of the robot's log", stages.chunks),
+        ("lines stored by the server", stages.stored), ("records equal to the bag's", stages.verified),
+    ]  # fmt: skip
+    times = [(name, f"{seconds * 1000:.0f} ms") for name, seconds in stages.times.items()]
+    heads = ("block", "chunks", "bytes", "gas", "gas/record", "transaction")
+    share = len(result.records) / max(1, sum(each.bytes for each in result.transactions))  # records a byte
+    batches = [
+        (each.block, each.chunks, each.bytes, each.gas, f"{each.gas / max(1.0, each.bytes * share):.0f}", each.hash)
+        for each in result.transactions
+    ]
+    said = [*result.verdict.lines(), *result.comparison.differences]
+    page = _html(chosen, result, drawn, [("Records", ("stage", ""), counts), ("Time", ("step", "time"), times),
+                                         ("Transactions", heads, batches)], said)  # fmt: skip
+    (report / "report.html").write_text(page, encoding="utf-8")
+    if json:
+        print_json({
+            "passed": result.passed, "seconds": result.seconds, "times": stages.times,
+            "counts": {"captured": stages.captured, "chunks": stages.chunks, "verified": stages.verified},
+            "contract": result.contract, "verdict": result.verdict.as_json(),
+            "differences": list(result.comparison.differences),
+            "transactions": [dict(zip(heads, row, strict=True)) for row in batches],
+        })  # fmt: skip
+    else:
+        data.print(table("Records", ["stage", "records"], counts, right=[1]))
+        data.print(table("Time", ["step", "time"], times, right=[1]))
+        data.print(table(f"Transactions to {result.contract}", heads, batches, right=[0, 1, 2, 3, 4]))
+    for line in said:
+        talk(line)
+    if not result.passed:
+        raise VerificationError("not every record came back as it is in the bag; the lines above say which")
+    talk(f"{stages.verified} of {stages.captured} records came back from the chain, proven and equal to the bag's, "
+         f"in {result.seconds:.1f} s. The report is {report / 'report.html'}.")
+
+
+def _expected(bag: Path, topics: list[str]) -> int:
+    from rosbridge_eth.sources import BagSettings, BagSource, Selection
+
+    source = BagSource(BagSettings(bag), Selection(topics))
+    try:
+        return source.message_count
     finally:
         source.close()
-    equal, differences = 0, []
-    for topic, messages in expected.items():
-        got = [record for record in records if record.topic == topic]
-        if len(got) != len(messages):
-            differences.append(f"{topic}: the bag has {len(messages)} messages, {len(got)} came back")
-        for (received_ns, message), record in zip(messages, got, strict=False):
-            wrong = _difference(record.data, message, "")
-            if record.received_ns != received_ns:
-                wrong = f"received at {record.received_ns} instead of {received_ns}"
-            if wrong is None:
-                equal += 1
-            else:
-                differences.append(f"{topic} at {received_ns}: {wrong}")
-    strangers = {record.topic for record in records} - expected.keys()
-    differences += [f"{topic} came back and is not in the bag" for topic in sorted(strangers)]
-    return Comparison(equal, tuple(differences))
 
 
-def _difference(value: Any, message: Any, path: str) -> str | None:
-    """The first place where captured JSON is not what the ROS message says; None if there is none."""
-    if isinstance(value, dict):
-        if not value:
-            return f"{path or 'the record'} is empty"
-        return next(
-            (
-                found
-                for name, part in value.items()
-                if (found := _difference(part, getattr(message, name), f"{path}.{name}".lstrip("."))) is not None
-            ),
-            None,
+def _html(
+    bag: Path, result: DemoResult, drawn: bool,
+    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[object]]]], said: Sequence[str],
+) -> str:  # fmt: skip
+    """A page that needs nothing but its folder."""
+
+    def rows(lines: Iterable[Sequence[object]], cell: str) -> str:
+        return "".join(
+            "<tr>" + "".join(f"<{cell}>{escape(str(value))}</{cell}>" for value in line) + "</tr>" for line in lines
         )
-    if isinstance(value, list):
-        if len(value) != len(message):
-            return f"{path} has {len(value)} elements instead of {len(message)}"
-        parts = (_difference(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(value, message, strict=True)))
-        return next((found for found in parts if found is not None), None)
-    if hasattr(message, "nanosec"):
-        message = message.sec * 10**9 + message.nanosec
-    return None if value == message else f"{path} is {value!r} instead of {message!r}"
+
+    verdict = "Every record came back, proven and equal to the bag's." if result.passed else (
+        "Not every record came back."
+    )  # fmt: skip
+    shown = "".join(
+        f"<h2>{title}</h2><div class=wide><table>{rows([heads], 'th')}{rows(lines, 'td')}</table></div>"
+        for title, heads, lines in tables
+    )
+    picture = '<img src="trajectory.png" alt="Trajectory drawn from the records on the chain">'
+    return f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>From a topic to the chain and back</title>
+<meta name="viewport" content="width=device-width">
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
+table {{ border-collapse: collapse; margin: .5rem 0 1.5rem }} td, th {{ border: 1px solid #ccc; padding: .2rem .7rem }}
+td {{ font-variant-numeric: tabular-nums }} .wide {{ overflow-x: auto }}
+.verdict {{ font-weight: 600; color: {"#1a6b3c" if result.passed else "#a32020"} }}
+img {{ max-width: 100% }} code {{ overflow-wrap: anywhere }}
+</style>
+<h1>From a topic to the chain and back</h1>
+<p class="verdict">{verdict}</p>
+<p>Bag <code>{escape(bag.name)}</code>, contract <code>{escape(result.contract)}</code>.
+The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
+<h2>The trajectory, from the chain</h2>{picture if drawn else "<p>No record holds a position.</p>"}
+{shown}<h2>The verdict</h2><ul>{"".join(f"<li>{escape(line.strip())}</li>" for line in said)}</ul>
+</html>
+"""
