@@ -9,6 +9,8 @@ Left out: ECN, state per path.
 
 from __future__ import annotations
 
+from collections import deque
+
 from rosbridge_eth.channel.wire import DATAGRAM_SIZE
 
 PACKET_THRESHOLD = 3
@@ -52,13 +54,14 @@ class RoundTrip:
 
 INITIAL_WINDOW = 16 * DATAGRAM_SIZE
 MINIMUM_WINDOW = 2 * DATAGRAM_SIZE
-QUEUE_SHARE = 8 * DATAGRAM_SIZE
-"""What a sender wants to have waiting in the path's queue."""
-NO_QUEUE = (1.25, 0.005)
-"""A round trip below 1.25 times the shortest one and 5 ms has met no queue."""
+QUEUE_SHARE = 4 * DATAGRAM_SIZE
+"""What each sender adds to a queue that is long enough: it makes those that share one come to equal windows."""
+QUEUE_TIME = 0.025  # s; a queue this long, and a quarter of the round trip, is long enough (LEDBAT++ aims at 0.06)
+QUEUE_SHARE_OF_RTT = 1 / 4
 GAIN = 1.7
-"""The window is at most so many times what one of the last round trips delivered: it holds up to 1 - 1/1.7 = 41 % of
-loss, and a link that drops instead of queueing is overdriven by no more than that."""
+GAIN_PERIOD = 6
+"""The window is at most GAIN times what one of the last GAIN_PERIOD round trips delivered: it holds up to 1 - 1/1.7 =
+41 % of loss, and a link that drops instead of queueing is overdriven by no more than that."""
 BASE_PERIOD = 30.0  # s; the shortest round trip is that of the last one or two periods
 PACING_GAIN = 1.25
 PACING_BURST = 10 * DATAGRAM_SIZE
@@ -67,8 +70,9 @@ PACING_BURST = 10 * DATAGRAM_SIZE
 class Window:
     """Congestion window in bytes, adjusted once a round trip, and the pacing that spreads it over one.
 
-    A round trip that met no queue doubles it; else window * shortest / present round trip + QUEUE_SHARE (FAST TCP,
-    Wei et al. 2006, with gamma = 1): it settles where QUEUE_SHARE of its bytes wait somewhere. `GAIN` bounds both.
+    A round trip that met less than half of the queue it may make doubles it; else it becomes
+    window * (shortest round trip + that queue) / present round trip + QUEUE_SHARE (FAST TCP, Wei et al. 2006, with
+    gamma = 1). `GAIN` bounds both.
     """
 
     __slots__ = (
@@ -85,7 +89,7 @@ class Window:
         self._base_at = now
         self._round_end = 0  # a round trip is over when a packet sent after its beginning is acknowledged
         self._delivered = 0
-        self._recent = (0, 0)  # what the two round trips before delivered
+        self._recent: deque[int] = deque(maxlen=GAIN_PERIOD)  # what round trips delivered
         self._allowance = float(PACING_BURST)
         self._paced_at = now
 
@@ -95,10 +99,10 @@ class Window:
         if rtt is not None:
             self._round_rtt = min(self._round_rtt, rtt)
         if largest >= self._round_end:
+            self._recent.append(self._delivered)
             if self._round_rtt < float("inf"):
                 self._adjust(now)
             self._round_end = next_number
-            self._recent = (self._recent[1], self._delivered)
             self._delivered, self._round_rtt, self.limited = 0, float("inf"), False
 
     def _adjust(self, now: float) -> None:
@@ -109,16 +113,16 @@ class Window:
         self._base = min(self._base, rtt)
         if not self.limited:
             return  # it was not put to the test
-        ratio, slack = NO_QUEUE
-        no_queue = rtt <= max(self._base * ratio, self._base + slack)
-        wanted = 2.0 * self.size if no_queue else self.size * self._base / rtt + QUEUE_SHARE
-        bound = GAIN * max(self._delivered, *self._recent)
+        queue = QUEUE_TIME + QUEUE_SHARE_OF_RTT * self._base
+        may_double = rtt < self._base + queue / 2
+        wanted = 2.0 * self.size if may_double else self.size * (self._base + queue) / rtt + QUEUE_SHARE
+        bound = GAIN * max(self._recent) + QUEUE_SHARE
         self.size = int(max(MINIMUM_WINDOW, min(wanted, bound, self.maximum)))
 
     def collapse(self) -> None:
         """After an outage: begin again at the minimum, so that what waited does not come as a flood (7.6)."""
         self.size = MINIMUM_WINDOW
-        self._recent = (0, 0)
+        self._recent.clear()
         self._allowance = min(self._allowance, float(MINIMUM_WINDOW))
 
     def wait(self, now: float, rtt: float) -> float:

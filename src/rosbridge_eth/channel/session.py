@@ -15,7 +15,7 @@ from heapq import heappop, heappush
 from typing import NamedTuple
 
 from rosbridge_eth.channel import wire
-from rosbridge_eth.channel.delivery import PACKET_THRESHOLD, RoundTrip, Window
+from rosbridge_eth.channel.delivery import RoundTrip, Window
 from rosbridge_eth.channel.events import ChannelConfig, Counters, Drop, End, Full
 from rosbridge_eth.channel.protection import Direction, ReplayWindow
 from rosbridge_eth.channel.wire import Ack, Malformed
@@ -288,10 +288,10 @@ class Session:
 
     def _find_lost(self, now: float) -> None:
         flying = self._in_flight
-        sent_before, below = now - self._round_trip.loss_delay(), self.largest_acked - PACKET_THRESHOLD
+        delay = self._round_trip.loss_delay()
         lost: list[int] = []
         for number, packet in flying.items():
-            if number > self.largest_acked or (number > below and packet.at > sent_before):
+            if number > self.largest_acked or packet.at + delay > now:
                 break
             lost.append(number)
         for number in lost:

@@ -1,8 +1,6 @@
-"""A network made of a seed: it loses, doubles, delays, reorders and corrupts datagrams, and moves hosts.
+"""A network made of a seed: it loses, doubles, delays, reorders and corrupts datagrams, queues them, and moves hosts.
 
-Whole conversations in simulated time,
-no socket, no sleeping, the same every time for the same seed. Random numbers
-here decide the fate of datagrams and are not near any key.
+Whole conversations in simulated time, no socket, no sleeping, the same every time for the same seed.
 """
 
 from __future__ import annotations
@@ -25,6 +23,10 @@ class Faults:
     delay: float = 0.02
     jitter: float = 0.0
     """Up to so much more delay, drawn for each datagram: what reorders them."""
+    rate: float = 0.0
+    """Bytes a second towards each host; 0: no limit."""
+    queue: int = 1 << 30
+    """Bytes that wait at most for a host; what does not fit is lost."""
 
 
 class Host:
@@ -47,6 +49,7 @@ class Network:
         self.delivered = 0
         self.watch: Callable[[bytes, Address, Address], None] | None = None
         """Called with every datagram sent (data, from, to), before its fate is drawn."""
+        self._free_at: dict[Address, float] = {}  # when the link to a host has sent what waits for it
         self._on_the_way: list[tuple[float, int, bytes, Address, Address]] = []
         self._calls: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
@@ -77,7 +80,14 @@ class Network:
         for _ in range(copies):
             if data and draw.random() < faults.corruption:
                 data = self._corrupted(data)
-            self.inject(data, source, target, faults.delay + draw.random() * faults.jitter)
+            waits = 0.0
+            if faults.rate:
+                waits = max(0.0, self._free_at.get(target, 0.0) - self.now)
+                if waits * faults.rate + len(data) > faults.queue:
+                    continue
+                waits += len(data) / faults.rate
+                self._free_at[target] = self.now + waits
+            self.inject(data, source, target, waits + faults.delay + draw.random() * faults.jitter)
 
     def _corrupted(self, data: bytes) -> bytes:
         draw = self.random
