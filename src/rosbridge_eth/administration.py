@@ -137,7 +137,7 @@ def init_home(
 
 
 def _make_ca(folder: Path, passphrase: bytes, now: datetime) -> CertificateAuthority:
-    if not (folder / "ca.key.pem").exists():
+    if not (folder / "ca.key.pem").exists() and not (folder / "ca.crt.pem").exists():
         made = ids.create_ca("rosbridge-eth CA", at=now)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_atomically(folder / "ca.crt.pem", made.certificate.to_pem(), new=True)
@@ -349,6 +349,8 @@ def register_robot(
     config, deployment, tk = load_server_config(home.config), home.deployment(), robot_id(check_name(name))
     if name == OPERATOR:
         raise IdentityError(f"{name!r} is what the treasury's account is called; choose another name for the robot")
+    if request is None and not password:
+        raise IdentityError("a robot is registered by its request, or under a password that seals the keys made here")
     if request is not None and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
     end = BridgeEnd(

@@ -27,7 +27,7 @@ from smcrypto import InvalidTag, sm4
 
 SCRYPT_N = 2**15  # 32 MiB and about a tenth of a second; for what a robot opens
 STRONG_SCRYPT_N = 2**17  # 128 MiB, as the keystores of Ethereum's clients
-_SCRYPT_R, _SCRYPT_P = 8, 1
+_SCRYPT_R, _SCRYPT_P, _SCRYPT_MEMORY = 8, 1, 2**28
 _NONCE = bytes(12)
 
 
@@ -126,7 +126,7 @@ def _key(password: bytes, head: Mapping[str, Any]) -> bytes:
     n, r, p = head["scrypt"]
     if (r, p) != (_SCRYPT_R, _SCRYPT_P) or not 2 <= n <= STRONG_SCRYPT_N:  # a stranger's file sets no cost
         raise ValueError("not a cost that this program writes")
-    return hashlib.scrypt(password, salt=bytes.fromhex(head["salt"]), n=n, r=r, p=p, maxmem=256 * n * r, dklen=16)
+    return hashlib.scrypt(password, salt=bytes.fromhex(head["salt"]), n=n, r=r, p=p, maxmem=_SCRYPT_MEMORY, dklen=16)
 
 
 def _canonical(head: Mapping[str, Any]) -> bytes:

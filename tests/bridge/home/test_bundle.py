@@ -1,50 +1,197 @@
-"""The bundle opens under its password, and under nothing else."""
+"""A robot joins: its request, the bundle, and the home that it makes of them."""
 
 from __future__ import annotations
 
 import json
+import os
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.bundle import Bundle, open_bundle, seal_bundle
-from rosbridge_eth.errors import IdentityError
+from rosbridge_eth import identity as ids
+from rosbridge_eth.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle
+from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
+from rosbridge_eth.identity import Role, load_identity
 
-BUNDLE = Bundle("robot_1", {"sign.key.pem": "-----BEGIN"}, "server_1", "127.0.0.1:7600", ("cert",), "0xabc", 31337)
-
-
-@pytest.fixture(scope="module")
-def sealed() -> bytes:
-    return seal_bundle(BUNDLE, b"horse")
-
-
-def test_it_opens_under_its_password(sealed: bytes) -> None:
-    assert open_bundle(sealed, b"horse") == BUNDLE
+NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
+CA, OTHER_CA = (ids.create_ca("CA", at=NOW) for _ in range(2))
+READER = ids.enrol(CA, Role.READER, "owner", at=NOW).public
+END = BridgeEnd("robot_1", "server", "192.0.2.7:7410", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 
 
-def test_a_wrong_password_is_refused(sealed: bytes) -> None:
+def answer(
+    request: Request, *, ca: ids.CertificateAuthority = CA, role: Role = Role.ROBOT, end: BridgeEnd = END
+) -> Bundle:
+    """What `register` makes of a request."""
+    peer = ids.enrol_requests(ca, role, request.name, request.signing, request.encryption, at=NOW)
+    certificates = {
+        "sign.crt.pem": peer.signing_certificate.to_pem().decode(),
+        "enc.crt.pem": peer.encryption_certificate.to_pem().decode(),
+        "ca.crt.pem": CA.certificate.to_pem().decode(),
+    }
+    return Bundle(end, certificates, {"owner": READER.pem.decode()})
+
+
+def with_keys(password: bytes = b"robot's") -> Bundle:
+    """What `register --password-file` makes."""
+    files = ids.identity_files(ids.enrol(CA, Role.ROBOT, "robot_1", at=NOW), [CA.certificate], password)
+    text = {name: content.decode() for name, content in files.items()}
+    keys = {name: text.pop(name) for name in ids.KEY_FILES}
+    return Bundle(END, text, {"owner": READER.pem.decode()}, keys)
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> RobotHome:
+    return RobotHome(tmp_path / "robot")
+
+
+def test_a_robot_makes_its_keys_and_is_certified_without_showing_them(home: RobotHome) -> None:
+    ask_to_join(home, "robot_1", b"robot's")
+    request = Request.decode(home.request.read_bytes())
+    with pytest.raises(ConfigError, match=r"no certificates yet: carry .*request\.json to the operator"):
+        home.bridge()
+    sent = answer(request).encode()
+    assert not needs_password(sent) and b"PRIVATE" not in sent + home.request.read_bytes()
+    assert join(home, read_bundle(sent)) == CA.certificate.fingerprint().hex()
+    identity, roots = load_identity(home.identity, b"robot's")
+    assert identity.name == "robot_1" and roots == (CA.certificate,)
+    assert home.bridge() == END and kind_of(home.path) is HomeKind.ROBOT
+    assert ids.public_identity((home.readers / "owner.pem").read_bytes()) == READER
+    for folder in (home.path, home.identity):
+        assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_the_keys_open_under_the_robots_own_password_alone(home: RobotHome) -> None:
+    request = ask_to_join(home, "robot_1", b"robot's")
+    join(home, answer(request))
+    with pytest.raises(IdentityError, match="wrong password"):
+        load_identity(home.identity, b"operator's")
+
+
+def test_a_bundle_with_keys_is_sealed_and_makes_a_home(home: RobotHome) -> None:
+    sealed = with_keys().encode(b"robot's")
+    assert needs_password(sealed) and b"BEGIN" not in sealed and b"192.0.2.7" not in sealed
     with pytest.raises(IdentityError, match="password is wrong"):
-        open_bundle(sealed, b"hors")
+        read_bundle(sealed, b"horse")
+    join(home, read_bundle(sealed, b"robot's"), b"robot's")
+    assert load_identity(home.identity, b"robot's")[0].name == "robot_1"
+    assert "PRIVATE" not in repr(read_bundle(sealed, b"robot's"))
+    with pytest.raises(IdentityError, match="protects nothing"):
+        with_keys().encode()
 
 
-def test_its_contents_are_not_readable(sealed: bytes) -> None:
-    assert b"BEGIN" not in sealed and b"server_1" not in sealed
+def test_nothing_is_written_of_a_bundle_whose_keys_do_not_open(home: RobotHome) -> None:
+    with pytest.raises(IdentityError, match="wrong password"):
+        join(home, with_keys(b"another"), b"robot's")
+    assert not home.path.exists()
 
 
-def test_an_altered_outer_field_is_noticed(sealed: bytes) -> None:
-    fields = json.loads(sealed)
-    fields["name"] = "robot_2"
-    with pytest.raises(IdentityError, match="altered"):
-        open_bundle(json.dumps(fields).encode(), b"horse")
+def test_a_bundle_for_other_keys_or_of_another_ca_is_refused_and_changes_nothing(
+    home: RobotHome, tmp_path: Path
+) -> None:
+    request = ask_to_join(home, "robot_1", b"robot's")
+    elsewhere = ask_to_join(RobotHome(tmp_path / "elsewhere"), "robot_1", b"robot's")
+    renamed = ask_to_join(RobotHome(tmp_path / "renamed"), "robot_2", b"robot's")
+    before = {path: path.read_bytes() for path in home.path.rglob("*") if path.is_file()}
+    swapped = Request("robot_1", request.encryption, request.signing)
+    wrong = {
+        "other keys": answer(elsewhere),
+        "another name": answer(renamed),
+        "swapped": answer(swapped),
+        "another CA": answer(request, ca=OTHER_CA),
+        "a reader": answer(request, role=Role.READER),
+        "the end is another's": answer(request, end=replace(END, robot="robot_2")),
+        "nothing": replace(answer(request), certificates={}),
+    }
+    for what, bundle in wrong.items():
+        with pytest.raises(IdentityError):
+            join(home, bundle)
+        assert {path: path.read_bytes() for path in home.path.rglob("*") if path.is_file()} == before, what
+    join(home, answer(request))
 
 
-def test_a_hostile_work_factor_is_refused_before_it_is_paid(sealed: bytes) -> None:
-    fields = json.loads(sealed)
-    fields["n"] = 2**40
-    with pytest.raises(IdentityError, match="format"):
-        open_bundle(json.dumps(fields).encode(), b"horse")
+def test_keys_that_are_certified_anew_join_again_and_another_ledger_does_not(home: RobotHome) -> None:
+    request = ask_to_join(home, "robot_1", b"robot's")
+    join(home, answer(request))
+    home.config.write_text('topics = ["/mine"]\n')
+    join(home, answer(request, end=replace(END, server_address="192.0.2.8:7410")))
+    assert home.bridge().server_address == "192.0.2.8:7410" and "/mine" in home.config.read_text()
+    with pytest.raises(ConfigError, match="another ledger"):
+        join(home, answer(request, end=replace(END, chain_id=1)))
 
 
-@pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"null", b'{"sealed": "!"}', b"\xff\xfe"])
-def test_what_is_no_bundle_is_refused(data: bytes) -> None:
-    with pytest.raises(IdentityError, match="not a bundle"):
-        open_bundle(data, b"horse")
+def test_a_robot_does_not_move_into_a_home_of_another(home: RobotHome, tmp_path: Path) -> None:
+    reader = ReaderHome(tmp_path / "reader")
+    reader.path.mkdir()
+    make_home(reader.path, HomeKind.READER)
+    other = RobotHome(reader.path)
+    for bundle in (with_keys(), answer(ask_to_join(home, "robot_1", b"robot's"))):
+        with pytest.raises(ConfigError, match="a reader's home"):
+            join(other, bundle, b"robot's")
+    with pytest.raises(ConfigError, match="a reader's home"):
+        ask_to_join(other, "robot_1", b"robot's")
+    with pytest.raises(ConfigError, match="a robot's home already"):
+        ask_to_join(home, "robot_1", b"robot's")
+    assert [path.name for path in reader.path.iterdir()] == ["home.json"]
+
+
+def test_a_bundle_without_keys_says_where_it_belongs(home: RobotHome, tmp_path: Path) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    with pytest.raises(ConfigError, match="made its own keys: join in that robot's home"):
+        join(RobotHome(tmp_path / "new"), bundle)
+    sealed = RobotHome(tmp_path / "sealed")
+    join(sealed, with_keys(), b"robot's")
+    with pytest.raises(IdentityError, match="made no request"):
+        join(sealed, bundle)
+
+
+def test_a_robot_whose_clock_begins_in_1970_believes_the_certificates_it_joined_with(home: RobotHome) -> None:
+    join(home, answer(ask_to_join(home, "robot_1", b"robot's")))
+    assert home.clock_floor() == (NOW - timedelta(days=1)).timestamp()
+
+
+def test_a_request_that_was_altered_is_refused() -> None:
+    request = Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2)))
+    head = json.loads(request.encode())
+    for change in ({"name": "../robot"}, {"signing": "-----BEGIN"}, {"signing": 5}, {"format": "x"}, {"name": None}):
+        with pytest.raises(IdentityError):
+            Request.decode(json.dumps(head | change).encode())
+    other = json.loads(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))).encode())
+    forged = Request.decode(json.dumps(head | {"name": "robot_2", "signing": other["signing"]}).encode())
+    with pytest.raises(IdentityError, match="CN=robot_2"):
+        answer(forged)
+
+
+@pytest.mark.parametrize("change", [
+    {"end": {}}, {"end": 5}, {"readers": {"../x": "pem"}}, {"certificates": 7}, {"keys": None}, {"readers": [5]},
+])
+def test_a_bundle_that_was_damaged_is_refused(change: dict[str, object]) -> None:
+    bundle = answer(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))))
+    with pytest.raises(IdentityError):
+        read_bundle(json.dumps(json.loads(bundle.encode()) | change).encode())
+
+
+def test_a_crash_while_joining_is_mended_by_joining_again(home: RobotHome, monkeypatch: pytest.MonkeyPatch) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    writes, real = 0, os.replace
+
+    def dies(at: int) -> None:
+        def counted(*args: object) -> None:
+            nonlocal writes
+            writes += 1
+            if writes == at:
+                raise KeyboardInterrupt
+            real(*args)  # type: ignore[arg-type]
+        monkeypatch.setattr(os, "replace", counted)
+
+    for at in range(1, 7):
+        writes = 0
+        dies(at)
+        with pytest.raises(KeyboardInterrupt):
+            join(home, bundle)
+        monkeypatch.setattr(os, "replace", real)
+        join(home, bundle)
+        assert load_identity(home.identity, b"robot's")[0].name == "robot_1" and home.bridge() == END

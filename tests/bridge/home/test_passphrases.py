@@ -27,6 +27,25 @@ def test_the_credentials_folder_is_used_where_no_file_is_named(tmp_path: Path) -
     assert read_passphrase("operator", "Operator", environment=environment) == b"secret"
 
 
+def test_which_file_holds_in_which_order(tmp_path: Path) -> None:
+    for name in ("given", "named", "rosbridge-eth-operator", "configured"):
+        (tmp_path / name).write_text(name)
+    credentials = {"CREDENTIALS_DIRECTORY": str(tmp_path)}
+    variable = {"ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE": str(tmp_path / "named")}
+
+    def read(file: str | None, environment: dict[str, str]) -> bytes:
+        return read_passphrase(
+            "operator", "Operator", file=None if file is None else tmp_path / file,
+            configured=tmp_path / "configured", environment=environment,
+        )
+
+    assert read("given", credentials | variable) == b"given"
+    assert read(None, credentials | variable) == b"named"
+    assert read(None, credentials) == b"rosbridge-eth-operator"
+    assert read(None, {}) == b"configured"
+    assert read(None, {"CREDENTIALS_DIRECTORY": "/nowhere"}) == b"configured"
+
+
 @pytest.mark.parametrize("content", [b"", b"\n", None])
 def test_an_empty_or_missing_file_is_refused_by_name(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:

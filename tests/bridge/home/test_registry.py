@@ -64,7 +64,8 @@ def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
         robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON),
     }
     assert registry.certificates_hash("robot_1") == keccak(newest.certificates)
-    assert registry.certificates_hash("robot_2") is None and robots[robot_id("robot_2")].hash == keccak(second.certificates)
+    assert registry.certificates_hash("robot_2") is None
+    assert robots[robot_id("robot_2")].hash == keccak(second.certificates)
     assert [reader.name for reader in registry.readers()] == ["owner"]
 
 
