@@ -2,39 +2,29 @@
 
 Accounts are those of BIP-44, m/44'/60'/0'/0/N, from a BIP-39 mnemonic or a raw
 seed: number 0 is the operator's, number n that of the n-th enrolment. A wallet
-given the mnemonic shows the same ones.
+given the mnemonic shows the same ones, so whoever wrote the words down needs no
+copy of the file.
 
-At rest the seed is under SM4-GCM with a key by scrypt from the passphrase,
-which is worked out once, however many robots there are:
-
-    {"version": 1, "kdf": {"name": "scrypt", "n", "r", "p", "salt"},
-     "cipher": {"name": "SM4-GCM", "nonce"}, "operator": address, "sealed": hex}
-
-Everything but `sealed` is authenticated with it. What is sealed is `kind`,
-a NUL, and the mnemonic in UTF-8 or the seed's bytes.
+At rest the seed is in a sealed box (files.py), whose key is worked out once, however many robots there are;
+the operator's address is shown in the clear. What is sealed is `kind`, a NUL, and the mnemonic in UTF-8 or
+the seed's bytes.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import secrets
-import tempfile
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosbridge_eth.errors import IdentityError
+from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_private, seal_box, write_atomically
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
 
+FORMAT = "rosbridge-eth accounts 2"
 WORDS = 24
 MIN_SEED, MAX_SEED = 16, 64  # bytes, BIP-32
-SCRYPT_N, SCRYPT_R, SCRYPT_P = 2**17, 8, 1  # 128 MiB, as the keystores of Ethereum's clients
-_SCRYPT_MEMORY = 2**30
-_KEY_SIZE, _SALT_SIZE, _NONCE_SIZE = 16, 32, 12
 _MNEMONIC, _RAW = b"mnemonic", b"raw"
 
 
@@ -120,85 +110,27 @@ class Keyring:
 
     # ------------------------------------------------------------------ at rest
 
-    def seal(self, passphrase: bytes, *, n: int = SCRYPT_N) -> bytes:
+    def seal(self, passphrase: bytes, *, n: int = STRONG_SCRYPT_N) -> bytes:
         """The file that `open` reads; `n` is scrypt's cost."""
-        from smcrypto.sm4 import SM4GCM
-
-        if not passphrase:
-            raise IdentityError("an empty passphrase protects nothing; choose another")
-        header: dict[str, Any] = {
-            "version": 1,
-            "kdf": {"name": "scrypt", "n": n, "r": SCRYPT_R, "p": SCRYPT_P, "salt": secrets.token_hex(_SALT_SIZE)},
-            "cipher": {"name": "SM4-GCM", "nonce": secrets.token_hex(_NONCE_SIZE)},
-            "operator": self.operator.address,
-        }
-        cipher = SM4GCM(_derive(passphrase, header["kdf"]))
-        plain = self._kind + b"\0" + self._secret
-        sealed = cipher.encrypt(bytes.fromhex(header["cipher"]["nonce"]), plain, _canonical(header))
-        return json.dumps(header | {"sealed": sealed.hex()}, indent=2).encode() + b"\n"
+        head = {"format": FORMAT, "operator": self.operator.address}
+        return seal_box(self._kind + b"\0" + self._secret, passphrase, head, n=n)
 
     @staticmethod
     def open(content: bytes, passphrase: bytes) -> Keyring:
         """The keyring of a sealed file; IdentityError if the passphrase or the file is wrong."""
-        from smcrypto import InvalidTag
-        from smcrypto.sm4 import SM4GCM
-
-        try:
-            header = json.loads(content)
-            sealed = bytes.fromhex(header.pop("sealed"))
-            nonce = bytes.fromhex(header["cipher"]["nonce"])
-            form = (header["version"], header["kdf"]["name"], header["cipher"]["name"])
-            key = _derive(passphrase, header["kdf"])
-        except (ValueError, KeyError, TypeError, AttributeError, MemoryError):
-            raise IdentityError("the accounts file is damaged; restore it or use the mnemonic") from None
-        if form != (1, "scrypt", "SM4-GCM"):
-            raise IdentityError("the accounts file is of another version of this program; use that one")
-        try:
-            kind, _, secret = SM4GCM(key).decrypt(nonce, sealed, _canonical(header)).partition(b"\0")
-        except InvalidTag:
-            raise IdentityError("the accounts file does not open: the passphrase is wrong, or it was changed") from None
+        kind, _, secret = open_box(content, passphrase, FORMAT)[1].partition(b"\0")
         return Keyring(kind, secret)
 
-    def save(self, path: Path, passphrase: bytes, *, n: int = SCRYPT_N) -> None:
+    def save(self, path: Path, passphrase: bytes, *, n: int = STRONG_SCRYPT_N) -> None:
         """Write the sealed file, readable by its owner alone, all of it or nothing. Never over another one."""
-        content = self.seal(passphrase, n=n)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
-            with os.fdopen(descriptor, "wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.link(temporary, path)  # fails where the file exists: a seed is never overwritten
-        except FileExistsError:
-            raise IdentityError(f"{path} exists already; it holds a seed and is not overwritten") from None
+            write_atomically(path, self.seal(passphrase, n=n), mode=0o600, new=True)
+        except FileExistsError as error:
+            raise IdentityError(f"{path} exists already; it holds a seed and is not overwritten") from error
         except OSError as error:
             raise IdentityError(f"cannot write {path}: {error.strerror}") from error
-        finally:
-            Path(temporary).unlink(missing_ok=True)
 
     @staticmethod
     def load(path: Path, passphrase: bytes) -> Keyring:
         """Read what `save` wrote; IdentityError also where others may read the file."""
-        try:
-            if path.stat().st_mode & 0o077:
-                raise IdentityError(f"{path} can be read by others; run: chmod 600 {path}")
-            content = path.read_bytes()
-        except OSError as error:
-            raise IdentityError(f"cannot read {path}: {error.strerror}") from error
-        return Keyring.open(content, passphrase)
-
-
-def _canonical(header: dict[str, Any]) -> bytes:
-    return json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
-
-
-def _derive(passphrase: bytes, kdf: dict[str, Any]) -> bytes:
-    return hashlib.scrypt(
-        passphrase,
-        salt=bytes.fromhex(kdf["salt"]),
-        n=kdf["n"],
-        r=kdf["r"],
-        p=kdf["p"],
-        maxmem=_SCRYPT_MEMORY,
-        dklen=_KEY_SIZE,
-    )
+        return Keyring.open(read_private(path), passphrase)

@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import ast
-import sys
+import gzip
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import subprocess
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-_recursion_limit = sys.getrecursionlimit()
-from web3.middleware import combine_middleware  # noqa: E402
-from web3.providers.eth_tester import EthereumTesterProvider  # noqa: E402
+from web3 import HTTPProvider
+from web3.middleware import combine_middleware
+from web3.providers.eth_tester import EthereumTesterProvider
+
+from rosbridge_eth.errors import BridgeError, ChainError
+from rosbridge_eth.files import write_atomically
+from rosbridge_eth.ledger.transport import limit_recursion, session
+
+log = logging.getLogger(__name__)
 
 _CALLER = "0x7E5F4552091A69125d5DfCb7b8C2659029395Bdf"  # eth-tester's first account, in whose name it makes calls
 
@@ -33,9 +48,7 @@ class EmbeddedChain(EthereumTesterProvider):
         }
         backend = PyEVMBackend(PyEVMBackend.generate_genesis_params({"gas_limit": gas_limit}), state)
         super().__init__(EthereumTester(backend))
-        # py-evm raises the limit of the whole process so far that deeply nested JSON would overflow the C stack.
-        # It wants it for calls within calls 1,024 deep; the contract here makes none.
-        sys.setrecursionlimit(_recursion_limit)
+        limit_recursion()  # py-evm wants more for calls within calls 1,024 deep; the contract here makes none
         self._lock = threading.RLock()
         # What web3 puts between itself and eth-tester, for requests that come in a batch.
         self._formatted = combine_middleware(self._middleware, None, self.make_request)  # type: ignore[arg-type]
@@ -57,3 +70,176 @@ class EmbeddedChain(EthereumTesterProvider):
 
     def make_batch_request(self, requests: Any) -> Any:
         return [self._formatted(method, params) for method, params in requests]
+
+
+# ---------------------------------------------------------------------- anvil
+
+VERSION = "1.7.1"
+START_SECONDS = 60.0  # the first start downloads it
+STOP_SECONDS = 10.0
+SAVE_SECONDS = 5.0  # between two looks whether there is something to save
+SAVE_SHARE = 20  # of the time at most so little is spent on saving
+TOLD_FROM = 256 * 2**20  # bytes of state that are worth a warning, and every doubling of it
+
+
+class Anvil:
+    """A running anvil at `url`. Ends with `stop`, or with the `with` block.
+
+    Where it has a state file, the chain survives. anvil itself would write the file in place, again and again; here it
+    is asked for its state and the file exchanged for a new one, so that what is there is whole at every moment.
+    A kill costs what came since the last time: 5 s, or twenty times as long as writing takes.
+    """
+
+    def __init__(self, port: int, process: subprocess.Popen[bytes], state: Path | None) -> None:
+        self.url = f"http://127.0.0.1:{port}"
+        self.state_size = 0  # bytes, when it was last written
+        self._process, self._state = process, state
+        self._provider = HTTPProvider(
+            self.url, {"timeout": 120.0}, session(limit=2**32), exception_retry_configuration=None
+        )
+        self._saved = ""
+        self._told = TOLD_FROM
+        self._stopped = threading.Event()
+        self._saver = threading.Thread(target=self._save_often, daemon=True)
+
+    def ask(self, method: str, *params: Any) -> Any:
+        """Any JSON-RPC call, such as anvil's own; ChainError if it gives no result."""
+        try:
+            answer: Any = self._provider.make_request(method, params)  # type: ignore[arg-type]
+            return answer["result"]
+        except (OSError, ValueError, KeyError) as error:
+            raise ChainError(f"anvil does not do {method}: {error}") from error
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def wait(self) -> int:
+        """Block until it ends; its exit code."""
+        return self._process.wait()
+
+    def save(self) -> None:
+        """Write the state file, if there is something new. ChainError."""
+        head = self.ask("eth_getBlockByNumber", "latest", False)["hash"]
+        if self._state is None or head == self._saved:
+            return
+        state = json.loads(gzip.decompress(bytes.fromhex(self.ask("anvil_dumpState")[2:])))
+        content = json.dumps(_trimmed(state)).encode()
+        write_atomically(self._state, content)
+        self._saved, self.state_size = head, len(content)
+        while self.state_size >= self._told:
+            log.warning(
+                "the chain's state takes %d MB, is written anew at every save and grows with every record; "
+                "use geth for a chain that is to stay", self.state_size // 10**6,
+            )  # fmt: skip
+            self._told *= 2
+
+    def _save_often(self) -> None:
+        pause = SAVE_SECONDS
+        while not self._stopped.wait(pause):
+            began = time.monotonic()
+            try:
+                self.save()
+            except BridgeError as error:
+                if self.running():
+                    log.error("the chain's state is not saved: %s", error)
+            pause = max(SAVE_SECONDS, SAVE_SHARE * (time.monotonic() - began))
+
+    def stop(self) -> None:
+        """Save the state, let it end; kill it if it does not."""
+        if self._saver.is_alive():
+            self._stopped.set()
+            self._saver.join()
+            if self.running():
+                self.save()
+        for sent in (signal.SIGINT, signal.SIGKILL):
+            if self.running():
+                self._signal(sent)
+
+    def kill(self) -> None:
+        """As a power cut would."""
+        self._stopped.set()
+        self._signal(signal.SIGKILL)
+
+    def _signal(self, number: signal.Signals) -> None:
+        try:
+            # npx starts anvil as a child of its own: the signal goes to the group that start_anvil() made.
+            os.killpg(self._process.pid, number)
+            self._process.wait(STOP_SECONDS)
+        except (ProcessLookupError, subprocess.TimeoutExpired):
+            pass
+
+    def __enter__(self) -> Anvil:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+def _trimmed(state: dict[str, Any]) -> dict[str, Any]:
+    """A state without what nobody asks for: traces, which are half of it, and first blocks that are not the chain's.
+
+    A restarted anvil makes a first block of its own before it reads the file, and later gives both; the start after
+    that takes either, and so may come back as another chain. Each is as old as its start: the oldest is the chain's.
+    """
+    for transaction in state["transactions"]:
+        transaction["info"]["traces"] = []
+    first = [block for block in state["blocks"] if int(block["header"]["number"], 16) == 0]
+    oldest = min(first, key=lambda block: int(block["header"]["timestamp"], 16))
+    state["blocks"] = [block for block in state["blocks"] if block is oldest or block not in first]
+    return state
+
+
+def start_anvil(
+    port: int, *, state: Path | None = None, block_time: float | None = None, log_file: Path | None = None,
+    options: Sequence[str] = (),
+) -> Anvil:  # fmt: skip
+    """Start anvil on 127.0.0.1:port and wait until it answers; npx fetches it the first time.
+
+    state: the file that keeps the chain. block_time: seconds between blocks; without it every transaction gets its
+    block at once. log_file: where its output goes (nowhere otherwise). ChainError if it is missing or does not start,
+    or the port is taken.
+    """
+    with socket.socket() as probe:  # otherwise whatever listens there would answer in anvil's place
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another one") from error
+    if shutil.which("anvil"):
+        command = ["anvil"]
+    elif shutil.which("npx"):
+        command = ["npx", "--yes", f"@foundry-rs/anvil@{VERSION}"]
+    else:
+        raise ChainError("a local chain needs anvil or, to fetch it, npx (of Node.js); install one of them")
+    command += ["--host", "127.0.0.1", "--port", str(port), *options]
+    if state is not None and state.exists():
+        command += ["--load-state", str(state)]
+    if block_time is not None:
+        command += ["--block-time", f"{block_time:g}"]
+    with (log_file.open("ab") if log_file else open(os.devnull, "wb")) as output:
+        process = subprocess.Popen(  # noqa: S603 - a fixed program, no shell
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+    anvil = Anvil(port, process, state)
+    deadline = time.monotonic() + START_SECONDS
+    while True:
+        try:
+            anvil.ask("eth_chainId")
+            break
+        except ChainError as error:
+            if anvil.running() and time.monotonic() < deadline:
+                time.sleep(0.05)
+                continue
+            anvil.kill()
+            raise ChainError(
+                f"anvil does not start on port {port}; {' '.join(command)} tells why"
+                + (f"; it may be that {state} is damaged" if state and state.exists() else "")
+            ) from error
+    if state is not None:
+        anvil.save()
+        anvil._saver.start()
+    return anvil

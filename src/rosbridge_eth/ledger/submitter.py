@@ -172,9 +172,9 @@ class Submitter:
         self._looked_at = self._cleaned_at = 0.0
         self.trouble: str | None = None  # why nothing can be written at all
         self.unconfirmed: str | None = None  # why nothing can be confirmed
-        self.unfunded: str | None = None  # why accounts are not topped up
+        self.funds: str | None = None  # why accounts are not topped up
         self.head: Block | None = None
-        self.balance: int | None = None  # the operator's, wei, a minute old at most
+        self.operator_balance: int | None = None  # the operator's, wei, a minute old at most
         self.counts: Counter[str] = Counter()
 
     @property
@@ -194,7 +194,7 @@ class Submitter:
             busy = self._look(head, now)
             if not 0 <= now - self._cleaned_at < MINUTE:
                 self._inbox.forget(now - DAY)
-                self.balance = self._ledger.balance(self._operator.address) if self._operator else None
+                self.operator_balance = self._ledger.balance(self._operator.address) if self._operator else None
                 self._cleaned_at = now
         except ChainError as error:
             self.trouble, self.head = str(error), None
@@ -475,14 +475,14 @@ class Submitter:
         stuck = pending > latest
         funds.fees = self._fees.at_least(funds.fees.raised()) if stuck and funds.fees else self._fees
         funds.since = now
-        self.balance = left = self._ledger.balance(self._operator.address)
-        self.unfunded, raws = None, list[bytes]()
+        self.operator_balance = left = self._ledger.balance(self._operator.address)
+        self.funds, raws = None, list[bytes]()
         for standing in sorted(poor, key=lambda standing: standing.balance)[:TOP_UPS]:
             data = self._ledger.calldata("allocETH", standing.account)
             wei = min(self._settings.top_up, BALANCE_LIMIT - standing.balance)
             left -= wei + call_gas(data) * funds.fees.highest
             if left < 0:
-                self.unfunded = f"the operator's account {self._operator.address} is empty; pay something into it"
+                self.funds = f"the operator's account {self._operator.address} is empty; pay something into it"
                 break
             if wei > 0:
                 nonce = latest + len(raws)
@@ -493,7 +493,7 @@ class Submitter:
         self.counts["top-ups"] += len(raws)
         for error in self._ledger.send(raws):
             if error is not None and not isinstance(error, AlreadyKnown):
-                self.unfunded = str(error)
+                self.funds = str(error)
 
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:

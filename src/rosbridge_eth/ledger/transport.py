@@ -20,6 +20,7 @@ import http.client
 import io
 import re
 import socket
+import sys
 import time
 from typing import Any
 from urllib.parse import urlsplit
@@ -85,6 +86,14 @@ TABLE: tuple[tuple[type[ChainError], str], ...] = (
     ),
 )
 _PATTERNS = tuple((kind, re.compile(pattern, re.IGNORECASE | re.DOTALL)) for kind, pattern in TABLE)
+
+
+def limit_recursion() -> None:
+    """Put Python's limit back, which py_ecc (imported by web3 and eth_account) and py-evm raise for the whole process.
+
+    With theirs, JSON nested deeply enough overflows the C stack, which no exception handler survives.
+    """
+    sys.setrecursionlimit(1000)
 
 
 def classify(message: object) -> ChainError:
@@ -164,7 +173,7 @@ class _TlsPool(HTTPSConnectionPool):
 class BoundedAdapter(HTTPAdapter):
     """Answers of at most `limit` bytes, unpacked; the deadline is the request's timeout."""
 
-    def __init__(self, limit: int = MAX_ANSWER) -> None:
+    def __init__(self, limit: int) -> None:
         self._limit = limit
         super().__init__()
 
@@ -188,10 +197,10 @@ class BoundedAdapter(HTTPAdapter):
         return response
 
 
-def session() -> requests.Session:
+def session(limit: int = MAX_ANSWER) -> requests.Session:
     """A session for one node; every request of it is to be given a timeout."""
     made = requests.Session()
-    adapter = BoundedAdapter()
+    adapter = BoundedAdapter(limit)
     made.mount("http://", adapter)
     made.mount("https://", adapter)
     return made
