@@ -1,15 +1,16 @@
-"""What a message costs the robot and the server, stage by stage, and how many go through in a second.
+"""What a record costs the robot, the server and the chain, stage by stage, and how many go through in a second.
 
-    python benchmarks/bridge_costs.py [--messages 3000] [--json FILE]
+    python benchmarks/bridge_costs.py [--records 20000] [--json FILE] [--first-edition FOLDER]
 
-The messages are the sample bag's Odometry, over and over. In the first part
-both ends run in one process without a socket, and the time of each stage is
-added up where it is spent. In the second, robot and server are two processes
-on loopback with everything real up to the server's commit.
+The messages are the sample bag's Odometry, over and over; captured are pose and twist, as the first edition did, or
+the whole message with its covariances. In the first part both ends run in one process without a socket, and the time
+of each stage is added up where it is spent. In the second, robot and server are two processes on loopback with
+everything real up to the server's commit. The gas is that of the contract on the embedded chain.
 
-For comparison, the paper's user end took 0.852 ms a message and its server
-0.422 ms to decrypt one, on an i9-10900KF at 3.7 GHz (Security and
-Communication Networks 2022, article 7206494).
+--first-edition: a checkout of commit ebd8d7e (`git worktree add FOLDER ebd8d7e`), whose own benchmark is run before
+and after, in the same environment. The paper's user end took 0.852 ms a message and its server 0.422 ms to decrypt
+one, on an i9-10900KF at 3.7 GHz; its storage slots cost 268,924 gas for 256 bytes (Security and Communication
+Networks 2022, article 7206494).
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import platform
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
@@ -30,23 +34,27 @@ from pathlib import Path
 from typing import Any
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule
-from rosbridge_eth.channel import Client, ClientConfig, MessageReceived, Server, ServerConfig, cookie_key
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.protocol import RecordStatus, Registration
-from rosbridge_eth.robot.process import TAKE, Robot
-from rosbridge_eth.robot.recorder import Recorder
-from rosbridge_eth.robot.sender import Sender
-from rosbridge_eth.sealing import Sealer
-from rosbridge_eth.server.reception import Reception
-from rosbridge_eth.server.worker import Worker
-from rosbridge_eth.sources import BagSettings, Selection
-from rosbridge_eth.sources.bag import BagSource
-from rosbridge_eth.sources.sample import sample_bag
-from rosbridge_eth.store import Spool, SqliteInbox
+from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.inbox.sqlite import SqliteInbox
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.robot import TAKE, Robot
+from rosbridge_eth.sender import Sender
+from rosbridge_eth.server import Reception, Worker
+from rosbridge_eth.sources import BagSettings, BagSource, Selection
+from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.writer import LogWriter
 
 TOPIC = "/robot_1/odom"
+POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pose", "twist.twist")
 NOW = datetime.now(UTC)
+LEDGER, PLACE = bytes(32), Log(bytes(32), robot_id("robot_1"))
+CERTIFICATES = bytes(32)
+GIB = 1 << 30
 
 
 class Identities:
@@ -59,23 +67,25 @@ class Identities:
         self.reader = ids.enrol(ca, ids.Role.READER, "owner", at=NOW)
         self.trust = ids.Trust((ca.certificate,))
 
-    def recorder(self, spool: Spool) -> Recorder:
-        sealer = Sealer(
-            self.robot.public.robot_id, partial(ids.sign, self.robot.signing_key),
-            [self.reader.encryption_certificate.public_key], previous=spool.last,
-        )
-        return Recorder(Capture([TopicRule(TOPIC)]), sealer, spool)
+    def spool(self, file: Path) -> Spool:
+        return Spool(file, PLACE, max_bytes=GIB, drop=partial(drop, PLACE, self.robot.signing_key))
 
-    def reception(self, server: Server, inbox: SqliteInbox) -> Reception:
-        registration = Registration(True, "0x0", "0x0", 1, 0)
-        return Reception(server, inbox, status_of=lambda id: RecordStatus("stored"),
-                         registration_of=lambda peer: registration)
+    def writer(self, period: float, now: float) -> LogWriter:
+        return LogWriter(
+            PLACE, self.robot.signing_key, [self.reader.encryption_certificate.public_key], previous=bytes(32),
+            stream_line=stream_line("bag", "benchmark"), period=period, now=now,
+        )
+
+    def reception(self, inbox: SqliteInbox) -> Reception:
+        server = Server(ServerConfig(), self.server, self.trust, cookie_key(self.server), time.monotonic())
+        return Reception(server, inbox, LEDGER, allowed=lambda peer: True, certificates=lambda name: CERTIFICATES)
 
 
 class Odometry:
     """A source of `count` messages: the sample bag's, again and again."""
 
-    live = False
+    live, kind = False, "bag"
+    dropped: Mapping[str, int] = {}
 
     def __init__(self, count: int) -> None:
         bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
@@ -86,12 +96,6 @@ class Odometry:
     def __iter__(self) -> Iterator[RawMessage]:
         for number in range(self.count):
             yield self.messages[number % len(self.messages)]
-
-    def offers(self) -> list[Any]:
-        return []
-
-    def decoders(self) -> dict[str, Any]:
-        return {}
 
     def run(self, emit: Any, stop: threading.Event) -> None:
         for message in self:
@@ -104,131 +108,199 @@ class Odometry:
 
 
 class Stopwatch:
-    """Seconds by stage."""
+    """Seconds of the processor's time by stage, and of the wall clock's: with it the disk is waited for."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
+        self.wall: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        started = time.perf_counter()
+        wall, started = time.perf_counter(), time.process_time()
         yield
-        self.seconds[stage] += time.perf_counter() - started
+        self.seconds[stage] += time.process_time() - started
+        self.wall[stage] += time.perf_counter() - wall
 
 
-def stage_costs(who: Identities, folder: Path, count: int) -> dict[str, dict[str, float]]:
-    """Milliseconds per message of each stage, both ends in one process, no socket."""
+def rule(whole: bool) -> TopicRule:
+    return TopicRule(TOPIC) if whole else TopicRule(TOPIC, fields=POSE_AND_TWIST)
+
+
+def stage_costs(who: Identities, folder: Path, records: int, per_chunk: int, whole: bool) -> dict[str, Any]:
+    """Milliseconds a record of each stage (processor, wall), both ends in one process; and the chunks made."""
     watch = Stopwatch()
-    spool, inbox = Spool(folder / "spool.sqlite", who.robot.public.robot_id), SqliteInbox(folder / "inbox.sqlite")
-    recorder = who.recorder(spool)
+    spool, inbox = who.spool(folder / "spool.sqlite"), SqliteInbox(folder / "inbox.sqlite", LEDGER, GIB, GIB)
     now = time.monotonic()
+    capture, writer = Capture([rule(whole)], source_kind="bag"), who.writer(1.0, now)
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
-    server = Server(ServerConfig(), who.server, who.trust, cookie_key(who.server), now)
-    sender, reception = Sender(client, spool), who.reception(server, inbox)
+    reception = who.reception(inbox)
+    server, sender = reception.server, Sender(client, spool)
     there, back = ("192.0.2.1", 7410), ("192.0.2.2", 5000)
     client.connect(there, now)
 
-    def exchange(measured: bool) -> None:
+    def exchange(watch: Stopwatch) -> None:
         now = time.monotonic()
-        watcher = watch if measured else Stopwatch()
-        with watcher("robot: send"):
-            spool.commit(now)
+        with watch("robot: send"):
             sender.send(now)
             client.handle_timer(now)
             sent = client.datagrams_to_send(now)
-        with watcher("server: receive and open"):
+        with watch("server: receive and open"):
             for data, _ in sent:
                 server.receive_datagram(data, back, now)
-            arrived = []
+        with watch("server: verify"):
             while (event := server.next_event()) is not None:
-                if isinstance(event, MessageReceived):
-                    arrived.append(event)
-        with watcher("server: commit and answer"):
-            if arrived:
-                reception.take(arrived, wall=time.time(), now=now)
+                reception.handle(event, now)
+        with watch("server: commit and answer"):
+            reception.turn(now + 1.0, time.time())
             server.handle_timer(now)
             answers = server.datagrams_to_send(now)
-        with watcher("robot: acknowledgements"):
+        with watch("robot: acknowledgements"):
             for data, _ in answers:
                 client.receive_datagram(data, there, now)
             while (event := client.next_event()) is not None:
                 sender.handle(event, now)
 
-    while not client.writable(time.monotonic()):
-        exchange(measured=False)
-    for number, raw in enumerate(Odometry(count)):
-        recorder.take(raw, wall_ns=time.time_ns(), mono_ns=time.monotonic_ns(), now=time.monotonic())
-        if number % TAKE == TAKE - 1:  # as the robot's loop turns while messages come in
-            exchange(measured=True)
+    unmeasured = Stopwatch()
+    while not sender.statistics.connected:
+        exchange(unmeasured)
+    chunks: list[Chunk] = []
+    for number, raw in enumerate(Odometry(records), 1):
+        with watch("robot: capture"):
+            record = capture.process(raw, time.time_ns(), True)
+        assert record is not None
+        with watch("robot: seal"):
+            now = time.monotonic()
+            line = partial(definition_line, raw.decoder)
+            writer.add(record.line, now, type_name=record.type_name, definition_line=line)
+            closed = writer.closed(now + 2.0, time.time_ns() // 10**6) if number % per_chunk == 0 else []
+        chunks += closed
+        with watch("robot: spool"):
+            for chunk in closed:
+                spool.append(chunk)
+        if number % TAKE == 0:  # as the robot's loop turns while messages come in
+            exchange(watch)
     while not sender.idle:
-        exchange(measured=True)
+        exchange(watch)
     spool.close()
     inbox.close()
-    times = recorder.times
-    robot = {"capture": times.capture, "seal": times.seal, "spool": times.spool,
-             "send": watch.seconds["robot: send"], "acknowledgements": watch.seconds["robot: acknowledgements"]}
-    serving = {"receive and open": watch.seconds["server: receive and open"],
-               "commit and answer": watch.seconds["server: commit and answer"]}
-    return {
-        end: {stage: seconds / count * 1000 for stage, seconds in stages.items()}
-        for end, stages in (("robot", robot), ("server", serving))
-    }
+    costs: dict[str, dict[str, tuple[float, float]]] = {"robot": {}, "server": {}}
+    for stage, seconds in watch.seconds.items():
+        end, _, what = stage.partition(": ")
+        costs[end][what] = (seconds / records * 1000, watch.wall[stage] / records * 1000)
+    return {"costs": costs, "chunks": chunks}
 
 
-def throughput(who: Identities, folder: Path, count: int) -> float:
-    """Messages per second from the bag to the server's commit, robot and server as two processes on loopback."""
+def gas(chunks: list[Chunk]) -> float:
+    """Gas of these chunks, in batches of 96 KiB, on the embedded chain."""
+    keys = Keyring.create()
+    chain = EmbeddedChain(fund={keys.operator.address: 10**21})
+    ledger, _ = Ledger.deploy(chain, keys.operator)
+    robot, total = keys.robot(1), 0
+    ledger.registration(keys.operator, PLACE.tk, robot.address, b"certificates")
+    ledger.alloc_eth(keys.operator, robot.address, 10**18)
+    batch: list[bytes] = []
+    for chunk in [*chunks, None]:
+        if batch and (chunk is None or sum(map(len, batch)) + len(chunk.encoded) > 96 * 1024):
+            total += ledger.set_data(robot, PLACE.tk, batch).gas_used
+            batch = []
+        if chunk is not None:
+            batch.append(chunk.encoded)
+    return float(total)
+
+
+def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tuple[float, float]:
+    """Records a second from the source to the server's commit, and records in a chunk; two processes on loopback."""
     [sock] = server_sockets(("127.0.0.1", 0))
     port = sock.getsockname()[1]
     context = multiprocessing.get_context("fork")
     stop = context.Event()
 
     def serve() -> None:
-        inbox = SqliteInbox(folder / "inbox-2.sqlite")
-        server = Server(ServerConfig(), who.server, who.trust, cookie_key(who.server), time.monotonic())
-        Worker(
-            server, who.reception(server, inbox),
-            lambda on_event, on_batch: UdpLoop(server, sock, on_event, on_batch=on_batch), lambda peer: True, lambda: 1,
-        ).run(stop.is_set)
+        reception = who.reception(SqliteInbox(folder / "inbox-2.sqlite", LEDGER, GIB, GIB))
+        Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)).run(stop.is_set)
 
     serving = context.Process(target=serve)
     serving.start()
-    spool = Spool(folder / "spool-2.sqlite", who.robot.public.robot_id)
-    recorder = who.recorder(spool)
-    client = Client(ClientConfig(), who.robot, who.trust, "server", time.monotonic())
+    spool, now = who.spool(folder / "spool-2.sqlite"), time.monotonic()
+    client = Client(ClientConfig(), who.robot, who.trust, "server", now)
     sender = Sender(client, spool)
     near, address = client_socket(("127.0.0.1", port))
     loop = UdpLoop(client, near, lambda event: sender.handle(event, time.monotonic()))
-    client.connect(address, time.monotonic())
-    robot = Robot(source=Odometry(count), recorder=recorder, sender=sender, spool=spool, client=client, loop=loop)
+    client.connect(address, now)
+    robot = Robot(
+        source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
+        writer=who.writer(0.05, now), spool=spool, client=client, loop=loop, sender=sender,
+    )  # fmt: skip
     started = time.perf_counter()
     robot.run()
     seconds = time.perf_counter() - started
     stop.set()
     serving.join(10)
-    if sender.statistics.stored < count:
-        raise SystemExit(f"only {sender.statistics.stored} of {count} were stored")
-    return count / seconds
+    if robot.captured < records:
+        raise SystemExit(f"only {robot.captured} of {records} were captured: {robot.summary}")
+    return records / seconds, records / robot.chunks
+
+
+def first_edition(folder: Path, records: int) -> dict[str, Any]:
+    """The figures of the first edition's own benchmark, in this environment."""
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        command = [sys.executable, str(folder / "benchmarks/bridge_costs.py"), "--messages", str(records),
+                   "--json", file.name]  # fmt: skip
+        environment = {**os.environ, "PYTHONPATH": str(folder / "src")}
+        subprocess.run(command, env=environment, check=True, capture_output=True)
+        figures: dict[str, Any] = json.loads(Path(file.name).read_bytes())
+    return figures
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--messages", type=int, default=3000)
+    parser.add_argument("--records", type=int, default=20_000)
     parser.add_argument("--json", type=Path, help="write the figures here as well")
+    parser.add_argument("--first-edition", type=Path, metavar="FOLDER")
     options = parser.parse_args()
-    who = Identities()
-    with tempfile.TemporaryDirectory() as folder:
-        costs = stage_costs(who, Path(folder), options.messages)
-        rate = throughput(who, Path(folder), options.messages)
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, "
-          f"{options.messages} Odometry messages\n")
-    print("| end | stage | ms per message |\n| --- | --- | ---: |")
-    for end, stages in costs.items():
-        for stage, cost in stages.items():
-            print(f"| {end} | {stage} | {cost:.3f} |")
-        print(f"| {end} | **in all** | **{sum(stages.values()):.3f}** |")
-    print(f"\nThrough loopback, robot and server as two processes: {rate:.0f} messages/s")
+    who, rows = Identities(), []
+    before = None if options.first_edition is None else first_edition(options.first_edition, 3000)
+    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+          f"{options.records} records, load average {os.getloadavg()[0]:.1f}\n")
+    for whole in (False, True):
+        for per_chunk in (1, 10, 100):
+            records = max(per_chunk, min(options.records, 200 * per_chunk))
+            with tempfile.TemporaryDirectory() as folder:
+                found = stage_costs(who, Path(folder), records, per_chunk, whole)
+            chunks = found["chunks"]
+            size = sum(len(chunk.encoded) for chunk in chunks) / records
+            row = {"fields": "all" if whole else "pose and twist", "records a chunk": per_chunk, "bytes": size,
+                   "gas": gas(chunks) / records, "costs": found["costs"]}  # fmt: skip
+            rows.append(row)
+    print("| captured | records a chunk | end | stage | processor, ms a record | wall clock |")
+    print("| --- | ---: | --- | --- | ---: | ---: |")
+    for row in rows:
+        for end, stages in row["costs"].items():
+            for stage, (cost, wall) in stages.items():
+                print(f"| {row['fields']} | {row['records a chunk']} | {end} | {stage} | {cost:.4f} | {wall:.4f} |")
+    print("\n| captured | records a chunk | robot, ms a record (wall clock) | server, ms a record (wall clock) "
+          "| bytes a record | gas a record |\n| --- | ---: | ---: | ---: | ---: | ---: |")
+    for row in rows:
+        robot, server = ([sum(each[k] for each in row["costs"][end].values()) for k in (0, 1)]
+                         for end in ("robot", "server"))  # fmt: skip
+        print(f"| {row['fields']} | {row['records a chunk']} | {robot[0]:.3f} ({robot[1]:.3f}) "
+              f"| {server[0]:.4f} ({server[1]:.4f}) | {row['bytes']:.0f} | {row['gas']:,.0f} |")
+    rates = []
+    for whole in (False, True):
+        with tempfile.TemporaryDirectory() as folder:
+            rate, per_chunk_ = throughput(who, Path(folder), options.records, whole)
+        rates.append({"fields": "all" if whole else "pose and twist", "records_per_second": rate})
+        print(f"\nThrough loopback, robot and server as two processes, {rates[-1]['fields']}: {rate:,.0f} records/s, "
+              f"{per_chunk_:.0f} records a chunk")
+    if options.first_edition is not None:
+        after = first_edition(options.first_edition, 3000)
+        for name, figures in (("before", before), ("after", after)):
+            assert figures is not None
+            robot, server = (sum(figures["milliseconds"][end].values()) for end in ("robot", "server"))
+            print(f"\nFirst edition, {name}: robot {robot:.3f} ms, server {server:.3f} ms a record, "
+                  f"{figures['messages_per_second']:,.0f} records/s")
     if options.json:
-        options.json.write_text(json.dumps({"milliseconds": costs, "messages_per_second": rate}, indent=1))
+        options.json.write_text(json.dumps({"rows": rows, "throughput": rates}, indent=1))
 
 
 if __name__ == "__main__":
