@@ -13,21 +13,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.robot.assembly import open_robot
 
 import rosbridge_eth
 from bridge.test_cli import Capture, fails, made, place
-from rosbridge_eth.bundle import open_bundle
 from rosbridge_eth.capture import RawMessage
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
-from rosbridge_eth.errors import ExitCode, IdentityError
-from rosbridge_eth.home import OperatorHome, RobotHome
-from rosbridge_eth.identity import Role, load_identity
+from rosbridge_eth.errors import ExitCode
+from rosbridge_eth.home import RobotHome
 from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot.assembly import join, open_robot
-from rosbridge_eth.robot.clock import certificate_clock
-from rosbridge_eth.server.administration import enrol_reader, load_ca, renew_server
 
 __all__ = ["made", "place"]  # fixtures
 
@@ -50,23 +46,6 @@ def test_a_database_that_fails_while_it_is_used_is_one_line(place: Path, capsys:
     assert len(error.splitlines()) == 1
 
 
-def test_keys_that_are_not_there_are_named(place: Path) -> None:
-    bundle = open_bundle(Path(BUNDLE).read_bytes(), b"robot's")
-    for name in ("sign.key.pem", "enc.key.pem"):
-        del bundle.identity[name]
-    with pytest.raises(IdentityError, match=r"nowhere/sign\.key\.pem cannot be read"):
-        join(RobotHome(Path("other")), bundle, b"robot's", Path("nowhere"))
-    assert not Path("other").exists()
-
-
-def test_a_robot_whose_clock_begins_in_1970_believes_the_certificates_it_joined_with(place: Path) -> None:
-    home = RobotHome(Path("robot"))
-    identity, _ = load_identity(OperatorHome(Path("operator")).server, b"operator's")
-    at = certificate_clock(home, lambda: DAY_ONE)()
-    assert identity.role is Role.SERVER
-    assert identity.public.not_before <= at <= datetime.now(UTC)
-
-
 def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     home = RobotHome(Path("robot"))
     Path("robot/robot.toml").write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
@@ -82,15 +61,6 @@ def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Path, monkeyp
 
 def test_usage_is_still_told_by_its_own_code(place: Path) -> None:
     assert run(["read"]) == ExitCode.USAGE
-
-
-@pytest.mark.parametrize("home, whose", [("operator", "an operator's"), ("operator/readers/owner", "a reader's")])
-def test_a_robot_does_not_move_into_a_home_of_another_kind(
-    place: Path, home: str, whose: str, capsys: Capture
-) -> None:
-    before = {path: path.read_bytes() for path in Path("operator").rglob("*") if path.is_file()}
-    fails(capsys, ExitCode.CONFIG, f"{home} is {whose} home", "join", BUNDLE, "--home", home, "--password-file", "word")
-    assert {path: path.read_bytes() for path in Path("operator").rglob("*") if path.is_file()} == before
 
 
 def test_ctrl_c_while_the_packages_load_is_one_line(tmp_path: Path) -> None:
@@ -122,53 +92,6 @@ def test_a_lost_registry_is_told_and_nothing_is_built_upon_an_empty_one(
     assert len(error.splitlines()) == 1
     assert registry.exists() == emptied
     assert sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry")) == before
-
-
-def test_the_server_is_renewed_twice_within_a_second(place: Path) -> None:
-    home, now = OperatorHome(Path("operator")), datetime.now(UTC)
-    ca = load_ca(home, b"operator's")
-    first = load_identity(home.server, b"operator's")[0].signing_certificate
-    kept = [renew_server(home, ca=ca, passphrase=b"operator's", now=now) for _ in range(3)]
-    assert len(set(kept)) == 3
-    assert load_identity(kept[0], b"operator's")[0].signing_certificate.to_der() == first.to_der()
-    assert load_identity(home.server, b"operator's")[0].role is Role.SERVER
-    assert not [path.name for path in home.path.iterdir() if "new" in path.name]
-
-
-def test_a_readers_name_is_made_anew_on_demand_and_the_old_keys_are_kept(place: Path, capsys: Capture) -> None:
-    ours = ("--passphrase-file", "pass", "--password-file", "word")
-    assert run(["reader", "analyst", *ours]) == 0
-    folder = OperatorHome(Path("operator")).reader("analyst")
-    old, _ = load_identity(folder, b"robot's")
-    fails(capsys, ExitCode.IDENTITY, "--replace", "reader", "analyst", *ours)
-    assert run(["revoke", "analyst", "--role", "reader", "--passphrase-file", "pass"]) in (0, ExitCode.CHAIN)
-    fails(capsys, ExitCode.IDENTITY, "--replace", "reader", "analyst", *ours)
-    for _ in range(2):  # a revoked one, and one in force
-        assert run(["reader", "analyst", "--replace", *ours]) == 0
-    new, _ = load_identity(folder, b"robot's")
-    assert {path.name for path in folder.iterdir()} >= {"public.pem", "reader.toml", "enc.key.pem"}
-    registry = Registry(Path("operator/registry.sqlite"))
-    assert registry.allows("reader", "analyst", new.signing_certificate.fingerprint())
-    assert not registry.allows("reader", "analyst", old.signing_certificate.fingerprint())
-    kept = sorted(path for path in folder.parent.iterdir() if path.name.startswith("analyst.until-"))
-    assert len(kept) == 2 and str(kept[0]) in capsys.readouterr().err
-    assert any(load_identity(path, b"robot's")[0].encryption_certificate == old.encryption_certificate for path in kept)
-
-
-def test_a_reader_that_is_not_made_leaves_the_old_one_where_it_is(
-    place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    home, now = OperatorHome(Path("operator")), datetime.now(UTC)
-    ca = load_ca(home, b"operator's")
-    before = sorted(home.path.rglob("*"))
-    monkeypatch.setattr("rosbridge_eth.server.administration.write_reader_toml", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        enrol_reader(home, "owner", ca=ca, password=b"word", now=now, replace=True)
-    assert [path for path in sorted(home.path.rglob("*")) if "registry" not in path.name] == [
-        path for path in before if "registry" not in path.name
-    ]
-    registry = Registry(home.registry)
-    assert registry.find("reader", "owner") == registry.all("reader")[0]
 
 
 def test_export_never_takes_the_treasury_for_a_robot(place: Path, capsys: Capture) -> None:

@@ -6,6 +6,9 @@ import os
 import shutil
 import socket
 import sqlite3
+import subprocess
+import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -103,29 +106,30 @@ def test_the_seed_of_a_mnemonic_and_a_passphrase_file_are_taken(tmp_path: Path) 
     assert load_server_config(home.config).passphrase_file == file
 
 
-def existing_ca(folder: Path, password: bytes) -> ids.CertificateAuthority:
-    """As `python -m smcrypto ca init` leaves one."""
-    ca = ids.create_ca("Fleet", at=NOW)
-    folder.mkdir()
-    (folder / "ca.crt.pem").write_bytes(ca.certificate.to_pem())
-    (folder / "ca.key.pem").write_bytes(ca.key.to_pem(password))
-    (folder / "ca.key.pem").chmod(0o600)
-    return ca
+def existing_ca(folder: Path, password: bytes) -> x509.Certificate:
+    """One of docs/fleet-ca.md."""
+    (folder.parent / "ca.pass").write_bytes(password)
+    subprocess.run(
+        [sys.executable, "-m", "smcrypto", "ca", "init", "--dir", folder, "--subject", "CN=Fleet CA,O=Example,C=CN",
+         "--path-length", "1", "--days", "3650", "--password-file", folder.parent / "ca.pass"],
+        check=True, capture_output=True,
+    )
+    return x509.Certificate.from_pem((folder / "ca.crt.pem").read_bytes())
 
 
 def test_an_existing_ca_certifies_and_its_key_stays_where_it_is(tmp_path: Path) -> None:
-    ca = existing_ca(tmp_path / "fleet", b"fleet's")
+    ca, now = existing_ca(tmp_path / "fleet", b"fleet's"), datetime.now(UTC)
     home, reader = OperatorHome(tmp_path / "home"), ReaderHome(tmp_path / "r")
-    admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=READER_PASSPHRASE, now=NOW,
+    admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=READER_PASSPHRASE, now=now,
                     ca=tmp_path / "fleet", ca_passphrase=b"fleet's")
     server, roots = load_identity(home.server, PASSPHRASE)
-    assert roots == (ca.certificate,) and home.ca == tmp_path / "fleet"
+    assert roots == (ca,) and home.ca == tmp_path / "fleet"
     assert not [path for path in home.path.rglob("*") if path.name == "ca.key.pem"]
     with registry_of(home) as known:
         assert admin.server_trust(home, known).check(
-            server.signing_certificate.to_der(), server.encryption_certificate.to_der(), role=Role.SERVER, at=NOW)
+            server.signing_certificate.to_der(), server.encryption_certificate.to_der(), role=Role.SERVER, at=now)
     admin.change_passphrase(home.path, PASSPHRASE, b"new")
-    assert load_ca(home.ca, b"fleet's", NOW).certificate == ca.certificate
+    assert load_ca(home.ca, b"fleet's", now).certificate == ca
 
 
 def registry_of(home: OperatorHome) -> Registry:
