@@ -146,8 +146,8 @@ class Inbox(Protocol):
     def close(self) -> None:
         """Let go of it."""
 
-    def _put_in_front(self, tk: bytes, tail: Chunk | None, on_chain: set[bytes], now: float) -> None:
-        """Remove the rows whose digest is in `on_chain`, then make `tail` the first row."""
+    def _put_in_front(self, tk: bytes, front: Sequence[Chunk], on_chain: set[bytes], now: float) -> None:
+        """Remove the rows whose digest is in `on_chain`, then make `front` the first rows."""
 
     def _load(self, tk: bytes) -> str | None:
         """The text last given to `_save`, which need not outlive a power cut."""
@@ -193,21 +193,27 @@ class Inbox(Protocol):
             )  # fmt: skip
 
     def rebase(
-        self, tk: bytes, tail: Chunk | None, on_chain: Collection[bytes], heads: Mapping[bytes, Head], now: float
+        self,
+        tk: bytes,
+        tail: Chunk | None,
+        on_chain: Collection[bytes],
+        heads: Mapping[bytes, Head],
+        now: float,
+        before: Sequence[Chunk] = (),
     ) -> None:
         """Make the rows follow a chain whose last chunk, `tail`, is not among them (None: the chain has none).
 
         Rows whose digest is in `on_chain` go, `tail` becomes the first row, the others stay behind it in their
         order, perhaps at other positions; heads are raised; nothing is confirmed until `confirm` says so. A caller
         who reads rows to see which of them are on the chain calls `raise_heads` before: then none that is can be
-        added meanwhile.
+        added meanwhile. before: what is on the chain right before the tail and not confirmed; it becomes rows, too,
+        because a robot is not asked again for what is below a head, should the chain turn back.
         """
-        if tail is not None:
-            heads = {tail.header.stream: Head(tail.header.number, tail.header.digest), **heads}
-            on_chain = {*on_chain, tail.header.digest}
-        self.raise_heads(tk, heads, now)
+        front = [*before, *([] if tail is None else [tail])]
+        newest = {one.header.stream: Head(one.header.number, one.header.digest) for one in front}
+        self.raise_heads(tk, newest | dict(heads), now)
         self.confirm(tk, None, now)
-        self._put_in_front(tk, tail, set(on_chain), now)
+        self._put_in_front(tk, front, {*on_chain, *(one.header.digest for one in front)}, now)
 
     def forget(self, before: float) -> None:
         """Remove rows that were confirmed long before `before` (at most as long again), and make room.

@@ -72,8 +72,14 @@ local function raise(stream, number, digest)
   if not known or above(number, known) then call('HSET', HEADS, stream, number .. digest) end
 end
 
+-- A row of seven arguments, its chunk, and its stream and number
+local function row_of(i, now)
+  local stream, number, digest, hash, size, records, encoded = unpack(ARGV, i, i + 6)
+  return {d = digest, h = hash, p = stream .. number, z = size, r = records, a = now}, encoded, stream, number
+end
+
 -- S(tored), K(nown), D(ifferent), or F(ull)
-local function append(now, share, max_bytes, stream, number, row, encoded)
+local function append(share, max_bytes, row, encoded, stream, number)
   local head = call('HGET', HEADS, stream)
   if head and not above(number, head) then
     local there = head:sub(1, 8) == number and head:sub(9) or call('HGET', PLACES, row.p)
@@ -96,9 +102,7 @@ end
 if operation == 'append' then -- now share max_bytes {stream number digest hash size records encoded}
   local outcomes, full = {}, false
   for i = 8, #ARGV, 7 do
-    local stream, number, digest, hash, size, records, encoded = unpack(ARGV, i, i + 6)
-    local row = {d = digest, h = hash, p = stream .. number, z = size, r = records, a = ARGV[5]}
-    outcomes[#outcomes + 1] = append(ARGV[5], full and 0 or ARGV[6], ARGV[7], stream, number, row, encoded)
+    outcomes[#outcomes + 1] = append(full and 0 or ARGV[6], ARGV[7], row_of(i, ARGV[5]))
     full = full or outcomes[#outcomes] == 'F'
   end
   return table.concat(outcomes)
@@ -116,15 +120,14 @@ elseif operation == 'remove' then -- tk why|"" dead_letters {entry}
     if entry then remove(entry, ARGV[5], why) end
   end
   call('XTRIM', P .. 'dead', 'MAXLEN', ARGV[7])
-elseif operation == 'put_in_front' then -- digest hash place size records now encoded|"" {digest on the chain}
-  local gone, rest = {}, {}
-  for i = 12, #ARGV do gone[ARGV[i]] = true end
+elseif operation == 'put_in_front' then -- now count {as of append} {digest on the chain}
+  local gone, rest, on_chain = {}, {}, 7 + 7 * ARGV[6]
+  for i = on_chain, #ARGV do gone[ARGV[i]] = true end
   for _, entry in ipairs(call('XRANGE', LOG, '-', '+')) do
     local row = table_of(entry[2])
     if gone[row.d] then remove(entry) else rest[#rest + 1] = row end
   end
   call('DEL', LOG)
-  local digest, hash, place, size, records, now, encoded = unpack(ARGV, 5, 11)
-  if encoded ~= '' then add({d = digest, h = hash, p = place, z = size, r = records, a = now}, encoded) end
+  for i = 7, on_chain - 1, 7 do add(row_of(i, ARGV[5])) end
   for _, row in ipairs(rest) do add(row) end
 end

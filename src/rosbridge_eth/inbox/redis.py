@@ -115,10 +115,7 @@ class RedisInbox(Inbox):
     def append(self, chunks: Sequence[tuple[bytes, Chunk]], now: float) -> list[Outcome]:
         calls: dict[bytes, list[Any]] = {}
         for tk, chunk in chunks:
-            header, encoded = chunk.header, chunk.encoded
-            arguments = calls.setdefault(tk, [repr(now), self.max_bytes_per_robot, self.max_bytes])
-            arguments += (header.stream, _number(header.number), header.digest, keccak(encoded))
-            arguments += (len(encoded), header.records, encoded)
+            calls.setdefault(tk, [repr(now), self.max_bytes_per_robot, self.max_bytes]).extend(_row(chunk))
         answers = self._run([("append", tk, arguments) for tk, arguments in calls.items()])
         letters = {tk: iter(answer.decode()) for tk, answer in zip(calls, answers, strict=True)}
         return [_OUTCOMES[next(letters[tk])] for tk, _ in chunks]
@@ -130,13 +127,9 @@ class RedisInbox(Inbox):
     def remove(self, tk: bytes, positions: Collection[int], why: str | None = None) -> None:
         self._run([("remove", tk, (tk, why or "", DEAD_LETTERS, *map(_entry, positions)))])
 
-    def _put_in_front(self, tk: bytes, tail: Chunk | None, on_chain: set[bytes], now: float) -> None:
-        row: tuple[Any, ...] = ("", "", "", 0, 0, 0, "")
-        if tail is not None:
-            header, encoded = tail.header, tail.encoded
-            place = header.stream + _number(header.number)
-            row = (header.digest, keccak(encoded), place, len(encoded), header.records, repr(now), encoded)
-        self._run([("put_in_front", tk, (*row, *on_chain))])
+    def _put_in_front(self, tk: bytes, front: Sequence[Chunk], on_chain: set[bytes], now: float) -> None:
+        rows = [part for chunk in front for part in _row(chunk)]
+        self._run([("put_in_front", tk, (repr(now), len(front), *rows, *on_chain))])
 
     def _save(self, tk: bytes, text: str) -> None:
         self._run([("save", tk, (text,))])
@@ -289,6 +282,13 @@ def _parts_of(url: str) -> dict[str, Any]:
     for name in sorted(parts.keys() - _URL_PARTS):
         raise StoreError(f"[store] url: the option {name!r} is not known")
     return parts
+
+
+def _row(chunk: Chunk) -> tuple[Any, ...]:
+    """A chunk as the script takes it."""
+    header, encoded = chunk.header, chunk.encoded
+    place = (header.stream, _number(header.number))
+    return (*place, header.digest, keccak(encoded), len(encoded), header.records, encoded)
 
 
 def _number(number: int) -> bytes:

@@ -174,14 +174,15 @@ class SqliteInbox(Inbox):
                 self._db.run("UPDATE robot SET bytes = bytes - ? WHERE tk = ?", (size, tk))
         self._db.run("DELETE FROM dead WHERE no <= (SELECT max(no) FROM dead) - ?", (DEAD_LETTERS,))
 
-    def _put_in_front(self, tk: bytes, tail: Chunk | None, on_chain: set[bytes], now: float) -> None:
+    def _put_in_front(self, tk: bytes, front: Sequence[Chunk], on_chain: set[bytes], now: float) -> None:
         def put() -> None:
             rows = self.rows(tk, None, -1)
             self._remove(tk, [row.position for row in rows if row.digest in on_chain], None)
-            if tail is not None:
-                self._db.run("INSERT OR IGNORE INTO robot (tk) VALUES (?)", (tk,))
-                first = "SELECT coalesce((SELECT min(position) - 1 FROM chunk WHERE tk = ?1), next) FROM robot"
-                self._add(tk, self._db.one(f"{first} WHERE tk = ?1", (tk,))[0], tail, keccak(tail.encoded), now)
+            self._db.run("INSERT OR IGNORE INTO robot (tk) VALUES (?)", (tk,))
+            free = "SELECT coalesce((SELECT min(position) - 1 FROM chunk WHERE tk = ?1), next) FROM robot WHERE tk = ?1"
+            (last,) = self._db.one(free, (tk,))
+            for position, chunk in enumerate(front, last - len(front) + 1):
+                self._add(tk, position, chunk, keccak(chunk.encoded), now)
 
         self._db.write(put)
 
