@@ -114,9 +114,10 @@ def _check(tokens: list[str], error: MakeError) -> None:
         scopes = scopes + 1 if token == "::" else scopes if before == "::" else 0  # noqa: S105 - a sign
         if scopes > _MAX_SCOPES or len(opened) > _MAX_NESTING:
             raise error("it is nested too deeply")
-        if token == "sequence" and opened[-1:] == ["<"]:  # noqa: S105 - a keyword of IDL
+        in_sequence = opened[-1:] == ["<"]
+        if token == "sequence" and in_sequence:  # noqa: S105 - a keyword of IDL
             raise error("a sequence of sequences is not supported")
-        bounds += token == "[" or (token == "<" and before != "sequence") or (token == "," and opened[-1:] == ["<"])
+        bounds += token == "[" or (token == "<" and before != "sequence") or (token == "," and in_sequence)  # noqa: S105
         if bounds > _MAX_BOUNDS:
             raise error("it has too many bounds")
         if token in "{[<":  # noqa: S105 - signs

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import ClassVar
 
@@ -57,6 +58,7 @@ class BagSettings:
 class BagSource:
     """One bag; it can be run again and then starts anew."""
 
+    kind = "bag"
     live = False
 
     def __init__(self, settings: BagSettings, selection: Selection, clock: Clock | None = None) -> None:
@@ -235,3 +237,14 @@ class BagSource:
 def _offer_name(connection: Connection) -> str:
     """The topic with its leading slash, which old recorders left out."""
     return connection.topic if connection.topic.startswith("/") else f"/{connection.topic}"
+
+
+def sample_bag() -> Path:
+    """The bag that ships with the package: /robot_1/odom and /robot_1/imu of a robot that drives a figure eight.
+
+    How it was recorded is told in samples/README.md of the repository. Raises SourceError.
+    """
+    path = Path(str(files("rosbridge_eth") / "samples" / "robot_1.bag"))
+    if not path.is_file():
+        raise SourceError(f"the sample bag {path} is missing: the package is not completely installed")
+    return path

@@ -30,6 +30,10 @@ class Source(Protocol):
     """A bag, a simulation, a live master. One thread calls `run`; `offers` and `close` may come from another."""
 
     @property
+    def kind(self) -> str:
+        """bag, sim, ros1 or ros2: stands in every line of the log."""
+
+    @property
     def live(self) -> bool:
         """Whether topics may still appear: a name that matches nothing is then no error."""
 

@@ -1,14 +1,13 @@
 """Which of the topics that a source offers are watched: by topic or by node, by name or by pattern.
 
-A node stands for the topics it publishes. Live sources resolve again every few
-seconds (Watch), since nodes and topics come and go.
+A node stands for the topics it publishes. Live sources resolve again every few seconds, since nodes and topics come
+and go.
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 from rosbridge_eth.capture import NamePattern
 from rosbridge_eth.errors import SourceError
@@ -83,44 +82,3 @@ class Selection:
             f"It has {topics}{more}" + (f", published by {', '.join(nodes[:20])}" if nodes else "")
             + ("" if nodes or not self.names_nodes else "; it does not say which nodes published: name topics")
         )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Changes:
-    """What to subscribe to and what to leave, after resolving again."""
-
-    added: tuple[Offer, ...]
-    removed: tuple[Offer, ...]
-
-
-class Watch:
-    """The selection over time, for live sources: ask the master when due, subscribe to what was added.
-
-    `now` is monotonic seconds. A type that changes under a topic's name is one
-    removal and one addition.
-    """
-
-    def __init__(self, selection: Selection, every: float = RESOLVE_EVERY) -> None:
-        self._selection = selection
-        self._every = every
-        self._due: float | None = None
-        self.watched: dict[tuple[str, str], Offer] = {}
-
-    def next_timer(self) -> float | None:
-        """When to ask again; None means now, for the first time."""
-        return self._due
-
-    def failed(self, now: float) -> None:
-        """The master did not answer: nothing is left for that, ask again later."""
-        self._due = now + self._every
-
-    def update(self, offers: Iterable[Offer], now: float) -> Changes:
-        """Take what is offered now; what changed among the watched topics."""
-        self._due = now + self._every
-        chosen = {(offer.topic, offer.type_name): offer for offer in self._selection.resolve(offers)}
-        changes = Changes(
-            tuple(offer for key, offer in chosen.items() if key not in self.watched),
-            tuple(offer for key, offer in self.watched.items() if key not in chosen),
-        )
-        self.watched = chosen
-        return changes

@@ -85,6 +85,7 @@ def drive(seed: int, rate: float) -> Iterator[Motion]:
 class SimSource:
     """The simulated robot as a source: `/NAME/odom` and `/NAME/imu`, published by the node `/NAME/sim`."""
 
+    kind = "sim"
     live = False
 
     def __init__(self, settings: SimSettings, selection: Selection, clock: Clock | None = None) -> None:

@@ -15,9 +15,9 @@ from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, samp
 
 
 def records(topic: str):
-    capture = Capture([TopicRule(topic)])
+    capture = Capture([TopicRule(topic)], source_kind=BagSource.kind)
     source = BagSource(BagSettings(sample_bag()), Selection([topic]))
-    return [capture.process(message, 0, 0) for message in source.messages()]
+    return [capture.process(message, 0) for message in source.messages()]
 
 
 def test_what_was_recorded():

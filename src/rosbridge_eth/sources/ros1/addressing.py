@@ -123,6 +123,6 @@ def uri_of(host: str, port: int) -> str:
 def node_name(configured: str | None) -> str:
     """The name that we register under. Anonymous unless configured, as `rosbag record` does it: two may run."""
     if configured is not None:
-        return configured
+        return f"/{configured.removeprefix('/')}"
     machine = re.sub(r"[^A-Za-z0-9_]", "_", socket.gethostname())[:60]
     return f"/rosbridge_eth_{machine}_{os.getpid()}"

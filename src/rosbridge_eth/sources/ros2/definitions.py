@@ -47,7 +47,7 @@ def definition_text(type_name: str, class_of: ClassOf = message_class) -> str:
     while open_names:
         name = open_names.pop(0)
         lines, referred = _lines(class_of(name))
-        heading = [] if name == type_name else [_SEPARATOR, f"MSG: {name}"]
+        heading = [] if name == type_name else [_SEPARATOR, f"MSG: {_spelled(name)}"]
         sections.append("\n".join([*heading, *lines]))
         new = [part for part in referred if part not in written]
         written.update(new)
@@ -72,6 +72,10 @@ def _lines(generated: Any) -> tuple[list[str], list[str]]:
     return lines, list(referred)
 
 
+def _spelled(name: str) -> str:
+    return name.replace("/msg/", "/")  # as definitions write it
+
+
 def _type(kind: Any) -> tuple[str, str | None]:
     """A type as MSG writes it, and the message it is or holds. Classes are told by name: rosidl is not imported."""
     match type(kind).__name__:
@@ -87,7 +91,7 @@ def _type(kind: Any) -> tuple[str, str | None]:
             return f"wstring<={kind.maximum_size}", None
         case "NamespacedType":
             name = "/".join(kind.namespaced_name())
-            return name, name
+            return _spelled(name), name
         case "Array":
             text, part = _type(kind.value_type)
             return f"{text}[{kind.size}]", part

@@ -18,7 +18,6 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any, ClassVar, Final
 
 from rosbridge_eth.capture import Decoder, RawMessage
@@ -27,7 +26,8 @@ from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
 from rosbridge_eth.sources.ros2.definitions import decoder_of, message_class
 from rosbridge_eth.sources.ros2.quality import Quality, most_that_all_offer, quality_of
-from rosbridge_eth.sources.selection import Selection, Watch
+from rosbridge_eth.sources.ros2.rclpy_parts import first_line, import_rclpy, name_of, take, type_hash_of
+from rosbridge_eth.sources.selection import Selection
 
 log = logging.getLogger(__name__)
 
@@ -44,13 +44,6 @@ UNMATCHED_AFTER: Final = 5.0
 STOP_TIME: Final = 2.0
 _SHARED: Final = frozenset({"/rosout", "/parameter_events"})
 """Topics that every node publishes; naming a node does not mean them."""
-_UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
-
-GET_RCLPY: Final = (
-    "start the robot in an environment where ROS 2 is sourced (source /opt/ros/DISTRO/setup.bash), with the Python "
-    "that ROS was built for, or install it beside this package: pip install 'ros-rclpy[fastrtps]' and the robot's "
-    "message packages, such as ros-nav-msgs; docs/howto-ros2.md tells more"
-)
 
 
 @dataclass(frozen=True)
@@ -108,12 +101,12 @@ class _Topic:
 class Ros2Source:
     """The watched topics of one ROS 2 graph. Its own rclpy context: no signal handler is set, no argument read."""
 
+    kind = "ros2"
     live = True
 
     def __init__(self, settings: Ros2Settings, selection: Selection, clock: Clock | None = None) -> None:
         """Joins the graph. Raises SourceError if rclpy is not there or cannot."""
         self._settings, self._selection, self._clock = settings, selection, clock or SystemClock()
-        self._watch = Watch(selection, LOOK_EVERY)
         self._backlog = Backlog()
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._unusable: set[tuple[str, str]] = set()
@@ -124,7 +117,7 @@ class Ros2Source:
         self._failure: BaseException | None = None
         self._closing = threading.Lock()
         self._open = False
-        self._rclpy = _import_rclpy()
+        self._rclpy = import_rclpy()
         self._context = self._rclpy.Context()
         try:
             # No logging: rclpy would open files in the home of whoever runs the robot.
@@ -141,7 +134,7 @@ class Ros2Source:
         except Exception as error:
             # rclpy has classes for bad names and domains and passes on what the middleware raises: an open set.
             self._context.try_shutdown()
-            raise SourceError(f"the ROS 2 graph cannot be joined: {_first_line(error)}") from error
+            raise SourceError(f"the ROS 2 graph cannot be joined: {first_line(error)}") from error
         self._open = True
         self._full_name = self._node.get_fully_qualified_name()
 
@@ -170,7 +163,7 @@ class Ros2Source:
         finally:
             self.close()
         if isinstance(self._failure, RuntimeError):
-            raise SourceError(f"the ROS 2 graph was lost: {_first_line(self._failure)}") from self._failure
+            raise SourceError(f"the ROS 2 graph was lost: {first_line(self._failure)}") from self._failure
         if self._failure is not None:
             raise self._failure
 
@@ -191,15 +184,15 @@ class Ros2Source:
 
     def statistics(self) -> Mapping[str, TopicCounts]:
         """By topic."""
+        topics = list(self._topics.values())
         dropped = self._backlog.dropped
         counts: dict[str, TopicCounts] = {}
-        for topic in list(self._topics.values()):
-            name = topic.offer.topic
-            so_far = counts.get(name, TopicCounts(dropped=dropped.get(name, 0)))
-            counts[name] = TopicCounts(
-                so_far.received + topic.received, so_far.lost + topic.lost, so_far.dropped,
-                so_far.foreign + topic.left_out,
-            )  # fmt: skip
+        for name in dict.fromkeys(topic.offer.topic for topic in topics):
+            types = [topic for topic in topics if topic.offer.topic == name]
+            received, lost, foreign = (
+                sum(getattr(topic, count) for topic in types) for count in ("received", "lost", "left_out")
+            )
+            counts[name] = TopicCounts(received, lost, dropped.get(name, 0), foreign)
         return counts
 
     @property
@@ -211,12 +204,11 @@ class Ros2Source:
 
     def _receive(self) -> None:
         try:
-            now = self._now()
-            complain_at = now + UNMATCHED_AFTER
+            due = self._now()
+            complain_at = due + UNMATCHED_AFTER
             while not self._ending.is_set():
                 now = self._now()
-                due = self._watch.next_timer()
-                if due is None or now >= due or self._look_now:
+                if now >= due or self._look_now:
                     self._look(now)
                     due = now + LOOK_EVERY
                 if now >= complain_at:
@@ -245,12 +237,12 @@ class Ros2Source:
             for key, topic in self._topics.items()
             if key not in published and now - topic.last_seen < KEEP
         ]
-        changes = self._watch.update([*offers, *waiting], now)
-        for offer in changes.removed:
-            if (gone := self._topics.pop((offer.topic, offer.type_name), None)) is not None:
-                self._leave(gone)
-        for offer in changes.added:
-            self._join(offer, publishers.get((offer.topic, offer.type_name), []), now)
+        wanted = {(offer.topic, offer.type_name): offer for offer in self._selection.resolve([*offers, *waiting])}
+        for key in self._topics.keys() - wanted.keys():
+            self._leave(self._topics.pop(key))
+        for key, offer in wanted.items():
+            if key not in self._topics and key not in self._unusable:
+                self._join(offer, publishers.get(key, []), now)
         for key, topic in self._topics.items():
             found = publishers.get(key, [])
             self._know(topic, found)
@@ -268,7 +260,7 @@ class Ros2Source:
                 continue
             nodes: dict[str, set[str]] = {}
             for endpoint in self._node.get_publishers_info_by_topic(name):
-                node = _node_name(endpoint)
+                node = name_of(endpoint)
                 if node == self._full_name:
                     continue
                 found = nodes.setdefault(endpoint.topic_type, set())
@@ -280,8 +272,6 @@ class Ros2Source:
 
     def _join(self, offer: Offer, publishers: Sequence[Any], now: float) -> None:
         key = (offer.topic, offer.type_name)
-        if key in self._unusable:
-            return
         try:
             quality = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
             generated, decoder = message_class(offer.type_name), decoder_of(offer.type_name)
@@ -295,12 +285,12 @@ class Ros2Source:
         log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)
 
     def _subscribe(self, topic: _Topic, quality: Quality) -> Any:
-        policies = self._rclpy
-        profile = policies.QoSProfile(
+        qos = self._rclpy.qos
+        profile = qos.QoSProfile(
             depth=self._settings.depth,
-            history=policies.HistoryPolicy.KEEP_LAST,
-            reliability=getattr(policies.ReliabilityPolicy, "RELIABLE" if quality.reliable else "BEST_EFFORT"),
-            durability=getattr(policies.DurabilityPolicy, "TRANSIENT_LOCAL" if quality.latched else "VOLATILE"),
+            history=qos.HistoryPolicy.KEEP_LAST,
+            reliability=getattr(qos.ReliabilityPolicy, "RELIABLE" if quality.reliable else "BEST_EFFORT"),
+            durability=getattr(qos.DurabilityPolicy, "TRANSIENT_LOCAL" if quality.latched else "VOLATILE"),
         )
         try:
             return self._node.create_subscription(
@@ -308,13 +298,13 @@ class Ros2Source:
                 topic.offer.topic,
                 self._callback(topic),
                 profile,
-                event_callbacks=policies.SubscriptionEventCallbacks(
+                event_callbacks=self._rclpy.SubscriptionEventCallbacks(
                     incompatible_qos=self._incompatible, use_default_callbacks=False
                 ),
                 raw=True,
             )
         except (RuntimeError, ValueError, TypeError) as error:
-            raise SourceError(f"it cannot be subscribed to: {_first_line(error)}") from error
+            raise SourceError(f"it cannot be subscribed to: {first_line(error)}") from error
 
     def _incompatible(self, event: Any) -> None:
         """A publisher has come that offers less than we ask for: look at once, not at the next turn."""
@@ -323,8 +313,8 @@ class Ros2Source:
     def _own_type_hash(self, offer: Offer) -> str | None:
         """The hash of the type as it is installed here, which our own subscription advertises."""
         for endpoint in self._node.get_subscriptions_info_by_topic(offer.topic):
-            if _node_name(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
-                return _type_hash(endpoint)
+            if name_of(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
+                return type_hash_of(endpoint)
         return None
 
     def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
@@ -336,7 +326,7 @@ class Ros2Source:
         foreign = {
             gid: endpoint
             for gid, endpoint in present.items()
-            if topic.type_hash is not None and _type_hash(endpoint) not in (None, topic.type_hash)
+            if topic.type_hash is not None and type_hash_of(endpoint) not in (None, topic.type_hash)
         }
         for endpoint in foreign.values():
             self._tell_foreign(topic, endpoint)
@@ -370,7 +360,7 @@ class Ros2Source:
 
     def _drain(self, topic: _Topic) -> None:
         """Take what the leaving subscription holds, which is older than what the new one brings."""
-        while (waiting := _take(topic.leaving, topic.generated)) is not None:
+        while (waiting := take(topic.leaving, topic.generated)) is not None:
             self._arrived(topic, *waiting)
 
     def _leave(self, topic: _Topic) -> None:
@@ -390,7 +380,7 @@ class Ros2Source:
             self._arrived(topic, raw, info)
             # What else waits is taken at once: a turn of the executor costs several times as much as a message.
             for _ in range(AT_ONCE if current else 0):
-                if (waiting := _take(topic.subscription, topic.generated)) is None:
+                if (waiting := take(topic.subscription, topic.generated)) is None:
                     break
                 self._arrived(topic, *waiting)
 
@@ -430,13 +420,13 @@ class Ros2Source:
             log.warning("%s: messages were lost on their way here (%d now, then counted); %s", name, count, why)
 
     def _tell_foreign(self, topic: _Topic, endpoint: Any) -> None:
-        if self._first(topic.offer.topic, _type_hash(endpoint) or ""):
+        if self._first(topic.offer.topic, type_hash_of(endpoint) or ""):
             kind = topic.offer.type_name
             log.warning(
                 "%s: %s publishes with another definition of %s than is installed here; its messages are left out and "
                 "counted. Build both from the same version of package %s",
                 topic.offer.topic,
-                _node_name(endpoint) or "somebody",
+                name_of(endpoint) or "somebody",
                 kind,
                 kind.partition("/")[0],
             )
@@ -457,66 +447,3 @@ class Ros2Source:
         first = (topic, what) not in self._said
         self._said.add((topic, what))
         return first
-
-
-@dataclass(frozen=True)
-class _Rclpy:
-    """The parts of rclpy that are used; its modules have no types here, and it is imported only when needed."""
-
-    Context: Any
-    Node: Any
-    SingleThreadedExecutor: Any
-    QoSProfile: Any
-    HistoryPolicy: Any
-    ReliabilityPolicy: Any
-    DurabilityPolicy: Any
-    SubscriptionEventCallbacks: Any
-
-
-def _import_rclpy() -> _Rclpy:
-    try:
-        qos = import_module("rclpy.qos")
-        try:
-            events = import_module("rclpy.event_handler")
-        except ModuleNotFoundError:  # before Iron
-            events = import_module("rclpy.qos_event")
-        return _Rclpy(
-            import_module("rclpy.context").Context,
-            import_module("rclpy.node").Node,
-            import_module("rclpy.executors").SingleThreadedExecutor,
-            qos.QoSProfile,
-            qos.HistoryPolicy,
-            qos.ReliabilityPolicy,
-            qos.DurabilityPolicy,
-            events.SubscriptionEventCallbacks,
-        )
-    except ModuleNotFoundError as error:
-        if error.name == "rclpy":
-            raise SourceError(f"a ROS 2 source needs rclpy, which this Python does not have; {GET_RCLPY}") from None
-        raise SourceError(f"rclpy is there but needs {error.name}, which is not; {GET_RCLPY}") from error
-    except ImportError as error:
-        raise SourceError(f"rclpy cannot be loaded: {_first_line(error)}; {GET_RCLPY}") from error
-
-
-def _take(subscription: Any, generated: Any) -> tuple[bytes, Mapping[str, Any]] | None:
-    """What the executor would take next from a subscription, without waiting."""
-    with subscription.handle:
-        taken: tuple[bytes, Mapping[str, Any]] | None = subscription.handle.take_message(generated, True)
-    return taken
-
-
-def _node_name(endpoint: Any) -> str | None:
-    """With its namespace; None while the graph has heard of the publisher, but not yet of its node."""
-    if endpoint.node_name == _UNKNOWN_NODE:
-        return None
-    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-
-
-def _type_hash(endpoint: Any) -> str | None:
-    """RIHS (REP 2016) of the type that an endpoint advertises; None if it does not."""
-    advertised = getattr(endpoint, "topic_type_hash", None)
-    return str(advertised) if advertised is not None and advertised.version > 0 else None
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().partition("\n")[0].partition(", at ")[0] or type(error).__name__

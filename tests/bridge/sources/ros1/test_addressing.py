@@ -97,6 +97,6 @@ def test_any_values_are_an_endpoint_or_refused(host, port):
 
 
 def test_names():
-    assert node_name("/a/b") == "/a/b"
+    assert node_name("/a/b") == node_name("a/b") == "/a/b"
     assert is_graph_name(node_name(None))
     assert not any(map(is_graph_name, ["", "/", "a", "/a b", "/a\n", "/" + "a" * 300, "/ä", None, 3]))

@@ -141,6 +141,10 @@ class Watcher(Program):
     def records(self) -> list[dict[str, Any]]:
         return self._of("record")
 
+    @property
+    def rebuilt(self) -> list[bool]:
+        return self._of("rebuilt")
+
     def opened(self) -> None:
         self.until(lambda: bool(self.lines), "the source's opening")
 

@@ -139,8 +139,8 @@ def test_a_class_is_written_out_with_its_parts_once():
     classes = {"own_msgs/msg/Outer": Outer, "own_msgs/msg/Inner": Inner}
     text = definition_text("own_msgs/msg/Outer", classes.__getitem__)
     assert text == (
-        "own_msgs/msg/Inner[2] pair\nfloat64[<=3] numbers\nstring[] words\nown_msgs/msg/Inner one\n"
+        "own_msgs/Inner[2] pair\nfloat64[<=3] numbers\nstring[] words\nown_msgs/Inner one\n"
         + "=" * 80
-        + "\nMSG: own_msgs/msg/Inner\nstring<=5 name\nbyte flags\n"
+        + "\nMSG: own_msgs/Inner\nstring<=5 name\nbyte flags\n"
     )
     assert decoder_for(Wire.CDR, "own_msgs/msg/Outer", text).type_name == "own_msgs/msg/Outer"

@@ -2,7 +2,7 @@
 
 watching.py robot.toml [hold]     with "hold", no message is taken before stdin ends: a robot that is slow
 
-Every line is a JSON object: {"record": ...}, or at the end {"statistics": ...}. SIGTERM ends it, as it does a robot.
+Every line is a JSON object: {"record": ..., "rebuilt": ...}, or at the end {"statistics": ...}. SIGTERM ends it, as it does a robot.
 """
 
 from __future__ import annotations
@@ -16,7 +16,15 @@ import time
 from dataclasses import asdict
 from pathlib import Path
 
-from rosbridge_eth.capture import Capture, RawMessage
+from rosbridge_eth.capture import (
+    Capture,
+    Captured,
+    Conversion,
+    RawMessage,
+    Restoration,
+    definition_line,
+    parse_line,
+)
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources import open_source
@@ -26,23 +34,31 @@ stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
 before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 config = load_robot_config(Path(sys.argv[1]))
-capture = Capture(config.rules())
 
 
 def say(value: dict[str, object]) -> None:
     print(json.dumps(value), flush=True)
 
 
+def rebuilt(captured: Captured) -> bool:
+    """Whether a reader who has the lines alone gets this message from them, as far as it was captured."""
+    restoration = Restoration(parse_line(definition_line(captured.decoder)).decoder())
+    restored = restoration.restore(parse_line(captured.line).data)
+    again = restoration.decoder.decode(restoration.decoder.encode(restored.message))
+    return bool(restored.missing) or Conversion(restoration.decoder).convert(again) == captured.data
+
+
 def emit(raw: RawMessage) -> None:
     if "hold" in sys.argv:
         sys.stdin.read()
-    record = capture.process(raw, time.time_ns(), time.monotonic_ns())
-    if record is not None:
-        say({"record": json.loads(record.to_json())})
+    captured = capture.process(raw, time.time_ns())
+    if captured is not None:
+        say({"record": json.loads(captured.line), "rebuilt": rebuilt(captured)})
 
 
 try:
     source = open_source(config.source_and_why({})[0].settings(), config.selection())
+    capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
     say(
         {
             "opened": type(source).__name__,
