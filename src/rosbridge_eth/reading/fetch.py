@@ -78,7 +78,18 @@ def read_robot(
     first_block = registrations[0].block if registrations else 0
     if resume and mark is not None:
         first_block = max(first_block, mark.block - MARGIN)
-    return Reading(verifier, verifier.read(ledger.data_events(tk, first_block, standing.data_block)), nodes)
+    events = ledger.data_events(tk, first_block, standing.data_block)
+    return Reading(verifier, _settled(ledger, block, verifier.read(events)), nodes)
+
+
+def _settled(ledger: Ledger, block: int, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
+    """The chunks; then ChainError if the chain was reorganised meanwhile: what is not there may have moved."""
+    before = ledger.block(block).hash
+    yield from chunks
+    if ledger.block(block).hash != before:
+        raise ChainError(
+            f"the chain of {shown(ledger.url)} was reorganised while it was read; read again, with more confirmations"
+        )
 
 
 def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, int, Standing, tuple[str, ...]]:

@@ -149,6 +149,18 @@ def test_a_name_that_nobody_has(chain):
         read_robot([chain.ledger], "Robot 9", trust=Trust([]), reader=None, now=NOW)
 
 
+def test_a_chain_that_is_reorganised_while_it_is_read_is_no_violation(chain):
+    class Moving(Node):
+        hashes = iter((b"a" * 32, b"b" * 32))
+
+        def block(self, number: int) -> Any:
+            return chain.ledger.block(number)._replace(hash=next(self.hashes))
+
+    chain.write(chain.pen.chunks(2))
+    with pytest.raises(ChainError, match="reorganised"):
+        numbers(chain.read(ledgers=[Moving(chain.ledger, "http://moving")]))
+
+
 # --- several nodes
 
 
