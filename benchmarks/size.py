@@ -3,8 +3,8 @@
     python benchmarks/size.py [--files] [SOURCE_FOLDER]
 
 Counted are the lines on which a token of the program stands, so that a statement over five lines is five
-lines; a docstring is a string that stands first in a module, class or function. Lua counts without blank
-lines and comments. The contract and generated files (JSON) are not counted.
+lines; a docstring is any string that stands alone. Lua counts without blank lines and comments. The contract and
+generated files (JSON) are not counted.
 """
 
 from __future__ import annotations
@@ -45,13 +45,11 @@ _NO_CODE = {
 
 
 def _docstring_lines(source: str) -> set[int]:
+    """The lines of strings that stand alone: docstrings of modules, classes, functions and of what is assigned."""
     lines: set[int] = set()
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
-            first = node.body[0]
-            constant = first.value if isinstance(first, ast.Expr) else None
-            if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
-                lines.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            lines.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return lines
 
 
