@@ -25,13 +25,12 @@ NOW = START.timestamp() + 90_000
 
 @dataclass
 class Chain:
+    where: EmbeddedChain
     ledger: Ledger
     pen: Pen
-    written: int = 0
 
     def write(self, chunks: Sequence[Any], account: Any = ACCOUNT) -> None:
         self.ledger.set_data(account, self.pen.log.tk, [chunk.encoded for chunk in chunks])
-        self.written += len(chunks)
 
     def read(self, *others: Any, ledgers: Sequence[Any] | None = None, **more: Any) -> Reading:
         return read_robot(
@@ -42,12 +41,13 @@ class Chain:
 
 @pytest.fixture
 def chain() -> Chain:
-    ledger, _ = Ledger.deploy(EmbeddedChain({OPERATOR.address: 1000 * ETH}), OPERATOR)
+    where = EmbeddedChain({OPERATOR.address: 1000 * ETH})
+    ledger, _ = Ledger.deploy(where, OPERATOR)
     pen = Pen()
     pen.log = Log(ledger.ledger, pen.log.tk)
     ledger.registration(OPERATOR, pen.log.tk, ACCOUNT.address, robot().public.certificates)
     ledger.alloc_eth(OPERATOR, ACCOUNT.address, ETH)
-    return Chain(ledger, pen)
+    return Chain(where, ledger, pen)
 
 
 def numbers(reading: Reading) -> list[int]:
@@ -99,7 +99,7 @@ def test_a_record_that_is_replayed_on_a_second_contract_is_refused(chain, tmp_pa
     first = chain.read()
     numbers(first)
     first.keep(bookmarks)
-    second, _ = Ledger.deploy(chain.ledger.w3.provider, OPERATOR)
+    second, _ = Ledger.deploy(chain.where, OPERATOR)
     second.registration(OPERATOR, chain.pen.log.tk, KEYS.robot(3).address, robot().public.certificates)
     second.alloc_eth(OPERATOR, KEYS.robot(3).address, ETH)
     second.set_data(KEYS.robot(3), chain.pen.log.tk, [chunk.encoded for chunk in chunks])
