@@ -3,8 +3,8 @@
     python benchmarks/size.py [--files] [SOURCE_FOLDER]
 
 Counted are the lines on which a token of the program stands, so that a statement over five lines is five
-lines; a docstring is any string that stands alone. Lua counts without blank lines and comments. The contract and
-generated files (JSON) are not counted.
+lines; a docstring is any string that stands alone. The script that runs inside Redis is told apart (Lua lines
+without blank ones and comments); the contract and generated files (JSON) are not counted.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def code_lines(path: Path) -> int:
 
 
 def files_of(package: Path) -> dict[Path, int]:
-    """Of each Python and Lua file of a package, its lines of code."""
-    return {path: code_lines(path) for path in sorted(package.rglob("*")) if path.suffix in (".py", ".lua")}
+    """Of each Python file of a package, its lines of code."""
+    return {path: code_lines(path) for path in sorted(package.rglob("*.py"))}
 
 
 def part_of(path: Path) -> str:
@@ -91,6 +91,8 @@ def main() -> None:
         if parts[part]:
             print(f"{parts[part]:7,}  {part}")
     print(f"{sum(bridge.values()):7,}  rosbridge_eth, {len(bridge)} files")
+    for path in sorted(package.rglob("*.lua")):
+        print(f"{code_lines(path):7,}  {path.relative_to(package)}, beside")
     print(f"{sum(library.values()):7,}  smcrypto, {len(library)} files")
 
 
