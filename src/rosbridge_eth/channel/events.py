@@ -186,7 +186,7 @@ class ServerConfig(ChannelConfig):
     max_connections: int = 4096
     max_total_bytes: int = 64 << 20
     """Of all sessions: messages that were not taken, parts of messages, and segments that came too early. Above it,
-    only what comes in order is taken."""
+    each session keeps a few of these, and else takes only what comes in order."""
     source_rate: float = 10.0
     source_burst: float = 400.0
     """Handshakes that one source may fail per second, and at once."""

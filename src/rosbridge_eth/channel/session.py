@@ -23,6 +23,8 @@ from smcrypto import InvalidTag
 
 RECEIVE_SEGMENTS = 1024
 """Segments from the next one on that a receiver has room for."""
+RESERVED_SEGMENTS = 16
+"""Of them, those that a session may keep before their turn though the process' budget is used up."""
 LENGTH_SIZE = 4
 KEEPING = 64
 """Bytes that a message or segment is taken to cost beside its own."""
@@ -35,7 +37,7 @@ CLOSE_CODES = (End.CLOSED, End.PROTOCOL, End.REPLACED, End.REVOKED, End.EXPIRED,
 
 
 class Budget:
-    """Bytes held for all sessions of a process. Above the limit, only what comes in order is taken."""
+    """Bytes held for all sessions of a process. Above the limit, little is taken that does not come in order."""
 
     __slots__ = ("limit", "used")
 
@@ -161,8 +163,6 @@ class Session:
 
     def _take_frames(self, frames: bytes, now: float) -> bool | None:
         """Whether the packet asks for an acknowledgement; None if there is no room for what it carries."""
-        if not frames:
-            raise Malformed("a packet without a frame")
         asks = False
         position, end = 0, len(frames)
         while position < end:
@@ -195,10 +195,11 @@ class Session:
             self._count["duplicates"] += 1
             return True
         if index > self._next_in:
-            if self._budget.used + len(data) + KEEPING > self._budget.limit:
+            size = len(data) + KEEPING
+            if len(self._early) >= RESERVED_SEGMENTS and self._budget.used + size > self._budget.limit:
                 return False
             self._early[index] = data
-            self._early_size += len(data) + KEEPING
+            self._early_size += size
         else:
             arrived = self._arrived
             arrived += data

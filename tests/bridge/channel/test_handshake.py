@@ -34,7 +34,7 @@ from rosbridge_eth.channel import (
     Drop,
     End,
     HandshakeFailed,
-    MessageReceived,
+    Message,
     Mode,
     Randomness,
     Reason,
@@ -48,14 +48,14 @@ from rosbridge_eth.channel.handshake import (
     VerifiedCertificates,
 )
 from rosbridge_eth.channel.wire import Hello
-from smcrypto import x509
 
 BOTH = (Mode.EXCHANGE, Mode.TRANSPORT)
 modes = pytest.mark.parametrize("mode", BOTH, ids=lambda mode: mode.name.lower())
 
 
 def expired(role: ids.Role, name: str) -> ids.Identity:
-    return ids.enrol(authority("operator"), role, name, at=BIRTH, valid_for=timedelta(days=1))
+    then = BIRTH - timedelta(days=1000)
+    return ids.enrol(ids.create_ca("operator", at=then), role, name, at=then)
 
 
 def swapped(who: ids.Identity) -> ids.Identity:
@@ -123,22 +123,6 @@ def test_a_server_refuses_who_is_not_on_the_allow_list_even_after_it_knew_them()
     assert server.peers() == []
 
 
-def test_a_server_refuses_a_certificate_on_the_revocation_list():
-    ca = authority("operator")
-    revoked = x509.CertificateRevocationList.create(
-        ca.certificate,
-        ca.key,
-        this_update=BIRTH,
-        next_update=TODAY + timedelta(days=30),
-        number=1,
-        revoked=[x509.RevokedCertificate(robot().encryption_certificate.serial_number, BIRTH)],
-    )
-    listed = ids.Trust((ca.certificate,), crls=(revoked,))
-    steps = Steps(server=make_server(1000.0, trust=listed))
-    steps.until_offer()
-    assert dropped(steps.server) == {Drop.CERTIFICATE: 1}
-
-
 FALSE_SERVERS = {
     "another CA": lambda: identity(ids.Role.SERVER, "hub", "stranger"),
     "another name": lambda: identity(ids.Role.SERVER, "other", "operator"),
@@ -204,7 +188,7 @@ def test_every_bit_of_a_proof_is_noticed(mode):
         for data in (flipped(first, bit), *rest):
             server.receive_datagram(data, HERE, steps.now)
         answers = [data for data, _ in server.datagrams_to_send(steps.now)]
-        assert all(data[0] == 6 for data in answers), bit  # at most a hint, never an OFFER
+        assert all(data[0] == 5 for data in answers), bit  # at most a hint, never an OFFER
         assert not server._connections, bit
         assert sum(dropped(server).values()) >= 1 or server.statistics().half_open == 1, bit  # or waits for pieces
         if 2 * 8 <= bit < 67 * 8:
@@ -268,9 +252,7 @@ def test_every_bit_of_the_finished_packet_is_noticed_without_a_reply(mode):
     steps = Steps(mode)
     finished = steps.until_finished()
     for bit in range(len(finished) * 8):
-        answers = steps.to_server(flipped(finished, bit))
-        # An altered connection id is an unknown connection: a reset for nobody, whose token no client holds.
-        assert all(data[0] == 5 and bit // 8 in range(2, 9) for data in answers), bit
+        assert steps.to_server(flipped(finished, bit)) == [], bit
     assert events(steps.server) == []
     steps.to_client(*steps.to_server(finished))
     assert [type(event) for event in events(steps.server)] == [Connected]
@@ -320,16 +302,15 @@ def test_what_an_end_sent_itself_is_not_taken_back():
     assert sum(dropped(steps.client).values()) == before + len(mine)
     theirs = [steps.cookie, *steps.offer, *steps.accepted]
     before = sum(dropped(steps.server).values())
-    answers = steps.to_server(*theirs)
+    assert steps.to_server(*theirs) == []
     assert sum(dropped(steps.server).values()) == before + len(theirs)
-    assert all(data[0] == 5 for data in answers)
     assert [type(event) for event in events(steps.server)] == [Connected]
 
 
 def test_one_mode_is_configured_and_none_is_fallen_back_to():
     steps = Steps(server=make_server(1000.0, ServerConfig(modes=(Mode.TRANSPORT,))))
     assert steps.to_server(steps.hello) == []
-    assert dropped(steps.server) == {Drop.VERSION_OR_MODE: 1}
+    assert dropped(steps.server) == {Drop.MODE: 1}
 
 
 def test_a_mode_changed_on_the_way_is_noticed_where_both_are_allowed():
@@ -489,7 +470,7 @@ def test_a_session_stands_until_the_new_one_is_finished():
     first.client.send(b"still here")
     first.to_server(*(data for data, _ in first.client.datagrams_to_send(first.now)))
     [heard] = events(server)
-    assert isinstance(heard, MessageReceived) and heard.payload == b"still here"
+    assert isinstance(heard, Message) and heard.payload == b"still here"
     second.to_server(finished)
     assert [type(event) for event in events(server)] == [Disconnected, Connected]
 

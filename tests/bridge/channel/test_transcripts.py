@@ -22,7 +22,7 @@ from rosbridge_eth.identity import Role
 from smcrypto import sm2
 
 FILE = Path(__file__).parents[2] / "vectors" / "channel" / "transcripts.json"
-TEXT = {"source", "mode", "client_address", "server_address"}
+TEXT = {"source", "mode", "client_address", "server_address", "server_time_ms"}
 
 try:
     hashlib.new("sm3")
@@ -147,10 +147,10 @@ def gcm_open(key: bytes, nonce: bytes, data: bytes, header: bytes) -> bytes:
 
 
 def packet(secret: bytes, data: bytes) -> bytes:
-    keys = hkdf(secret, 60, b"", b"rosbridge-eth/1 packets")
-    number = int.from_bytes(data[9:15], "big")
+    keys = hkdf(secret, 28, b"", b"rosbridge-eth/2 packets")
+    number = int.from_bytes(data[9:13], "big")
     nonce = (int.from_bytes(keys[16:28], "big") ^ number).to_bytes(12, "big")
-    return gcm_open(keys[:16], nonce, data[15:], data[:15])
+    return gcm_open(keys[:16], nonce, data[13:], data[:13])
 
 
 def split(body: bytes) -> list[bytes]:
@@ -185,14 +185,14 @@ def shared_secret(v, client_id: bytes, server_id: bytes, r_a: bytes, r_b: bytes)
 @case
 def test_the_transcript_follows_from_the_documents(v):
     mode = {"exchange": 1, "transport": 2}[v.mode]
-    assert v.hello[:3] == bytes((1, 1, mode)) and len(v.hello) == 1200 and not any(v.hello[43:])
+    assert v.hello[:3] == bytes((1, 2, mode)) and len(v.hello) == 1200 and not any(v.hello[43:])
     client_cid, nonce = v.hello[3:11], v.hello[11:43]
-    assert v.cookie[:42] == b"\x02\x01" + client_cid + nonce
+    assert v.cookie[:42] == b"\x02\x02" + client_cid + nonce
     cookie = v.cookie[42:]
     for index, data in enumerate(v.proof):
         assert data[:69] == b"\x03" + v.hello[1:43] + cookie + bytes((index, len(v.proof)))
     for index, data in enumerate(v.offer):
-        assert data[:12] == b"\x04\x01" + client_cid + bytes((index, len(v.offer)))
+        assert data[:12] == b"\x04\x02" + client_cid + bytes((index, len(v.offer)))
     proof = split(b"".join(data[69:] for data in v.proof))
     offer = split(b"".join(data[12:] for data in v.offer))
     assert (len(proof), len(offer)) == (4, 8)
@@ -201,9 +201,9 @@ def test_the_transcript_follows_from_the_documents(v):
     assert len(server_nonce) == 32 and server_cid[0] == 0
     assert v.client_signing_public in client_sign and v.server_signing_public in server_sign
 
-    so_far = b"rosbridge-eth/1 handshake\0" + bytes((1, mode)) + client_cid + nonce + cookie
+    so_far = b"rosbridge-eth/2 handshake\0" + bytes((2, mode)) + client_cid + nonce + cookie
     so_far += joined(client_sign, client_enc, r_a)
-    purpose = b"rosbridge-eth/1 handshake\0"
+    purpose = b"rosbridge-eth/2 handshake\0"
     check_signature(point(v.client_signing_public), purpose + b"client" + sm3(so_far), client_signature)
     so_far += joined(client_signature, server_nonce, server_cid, server_sign, server_enc, material)
     check_signature(point(v.server_signing_public), purpose + b"server" + sm3(so_far), server_signature)
@@ -221,18 +221,22 @@ def test_the_transcript_follows_from_the_documents(v):
         assert r_a == b"" and s_b == b""
         assert sm2.PrivateKey.from_bytes(v.client_encryption_key).decrypt(material) == v.shared
 
-    secrets = hkdf(v.shared, 128, h3, b"rosbridge-eth/1 session " + v.mode.encode())
+    secrets = hkdf(v.shared, 128, h3, b"rosbridge-eth/2 session " + v.mode.encode())
     client, server, client_finished, server_finish = (secrets[i : i + 32] for i in range(0, 128, 32))
     assert (client, server) == (v.client_secret, v.server_secret)
     assert server_finished == mac(server_finish, h3)
     h4 = sm3(so_far + joined(server_finished))
-    assert v.finished[:15] == b"\x40" + server_cid + bytes(6)
-    assert packet(client, v.finished)[:65] == b"\x0a" + s_a + mac(client_finished, h4)
+    assert v.finished[:13] == b"\x40" + server_cid + bytes(4)
+    first = b"\x03" + bytes(4)
+    assert packet(client, v.finished) == first + (64).to_bytes(4, "big") + s_a + mac(client_finished, h4)
     [accepted] = v.accepted
-    frames = packet(server, accepted)
-    assert accepted[1:9] == client_cid and b"\x0b" in frames
+    assert accepted[1:9] == client_cid
+    acknowledgement = b"\x02" + bytes(4) + bytes(2) + (1).to_bytes(4, "big") + (1025).to_bytes(4, "big") + b"\1\1"
+    time = packet(server, accepted).removeprefix(acknowledgement).removeprefix(first + (8).to_bytes(4, "big"))
+    assert int.from_bytes(time, "big") == v.server_time_ms
     message = packet(client, v.message)
-    assert message.endswith(b"\x03" + bytes(4) + len(v.message_payload).to_bytes(2, "big") + v.message_payload)
+    length = len(v.message_payload).to_bytes(4, "big")
+    assert message.endswith(b"\x03" + (1).to_bytes(4, "big") + length + v.message_payload)
 
 
 @case
@@ -241,8 +245,8 @@ def test_our_functions_give_the_recorded_values(v):
 
     secrets = SessionSecrets(v.shared, v.h3, Mode[v.mode.upper()])
     assert (secrets.client, secrets.server) == (v.client_secret, v.server_secret)
-    assert Direction(v.client_secret).open(v.finished, 0)[0] == 0x0A
-    number = int.from_bytes(v.message[9:15], "big")
+    assert Direction(v.client_secret).open(v.finished, 0)[0] == 3
+    number = int.from_bytes(v.message[9:13], "big")
     assert Direction(v.client_secret).open(v.message, number).endswith(v.message_payload)
     if v.mode == "exchange":
         proof = split(b"".join(data[69:] for data in v.proof))

@@ -1,9 +1,8 @@
 """Robots and a server on the simulated network, with the program that each end would run.
 
-`RobotProgram` is a spool in the small: what has no answer is sent again in the
-next session. `ServerProgram` commits after a while and then replies; what it
-committed survives its restarts, what it only heard does not. Both write down
-whatever a promise of the channel forbids.
+`RobotProgram` has messages to be stored: at each session it asks what the server has of them, and sends what follows.
+`ServerProgram` stores after a while and then says so; what it stored survives its restarts, what it only heard does
+not. Both write down whatever a promise of the channel forbids.
 """
 
 from __future__ import annotations
@@ -11,24 +10,19 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from functools import cache
 
+from bridge.channel.simulation import Host, Network
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import (
-    AddressChanged,
     Client,
     ClientConfig,
     Connected,
     Disconnected,
     Event,
-    Full,
-    HandshakeFailed,
-    MessageAnswered,
-    MessageReceived,
-    NotConnected,
+    Message,
     Server,
     ServerConfig,
     cookie_key,
 )
-from rosbridge_eth.channel.simulation import Host, Network
 
 BIRTH = datetime(2026, 1, 1, tzinfo=UTC)
 TODAY = BIRTH + timedelta(days=30)
@@ -88,22 +82,18 @@ def make_client(
     )
 
 
-def answer_to(payload: bytes) -> bytes:
-    """What the server's program replies: recognisably to this message, and sometimes in parts."""
-    return b"answer to " + payload[:12] + (payload if len(payload) % 7 == 0 else b"")
-
-
 class ServerProgram:
+    """Messages up: `?`, or a number and what is to be stored. Down: how many are stored, after each of them."""
+
     def __init__(self, network: Network, config: ServerConfig | None = None, commit_delay: float = 0.0) -> None:
         self.network = network
         self.config = config
         self.commit_delay = commit_delay
-        self.committed: list[bytes] = []
-        self.heard: set[tuple[int, bytes, int]] = set()
+        self.stored: dict[str, list[bytes]] = {}
+        self.next: dict[bytes, int] = {}
         self.events: list[Event] = []
         self.broken: list[str] = []
         self.most_held = 0
-        self.starts = 0
         self.host: Host = network.attach(self._start(), SERVER_ADDRESS, self.on_event)
 
     @property
@@ -112,7 +102,6 @@ class ServerProgram:
         return self.host.endpoint
 
     def _start(self) -> Server:
-        self.starts += 1
         return make_server(self.network.now, self.config)
 
     def restart(self) -> None:
@@ -120,28 +109,42 @@ class ServerProgram:
 
     def on_event(self, event: Event) -> None:
         self.most_held = max(self.most_held, self.server.statistics().held_bytes)
-        if not isinstance(event, MessageReceived):
+        if not isinstance(event, Message):
             self.events.append(event)
             return
-        key = (self.starts, event.connection, event.message_id)
-        if key in self.heard:
-            self.broken.append(f"message {event.message_id} was delivered twice in a session")
-        self.heard.add(key)
+        stored = self.stored.setdefault(event.peer.name, [])
+        if event.payload == b"?":
+            if event.connection in self.next:
+                self.broken.append("a question was heard twice in a session")
+            self.next[event.connection] = len(stored)
+            self._say(event.connection, len(stored))
+            return
+        number = int.from_bytes(event.payload[:4], "big")
+        expected = self.next.get(event.connection, -1)
+        if number != expected:
+            self.broken.append(f"message {number} came where {expected} was expected")
+        self.next[event.connection] = number + 1
         server = self.server
 
         def commit() -> None:
-            if server is self.server:  # else this process died before its commit
-                self.committed.append(event.payload)
-                server.reply(event.connection, event.message_id, answer_to(event.payload))
+            if server is not self.server:
+                return  # this process died before its commit
+            if number == len(stored):
+                stored.append(event.payload[4:])
+            self._say(event.connection, len(stored))
 
         if self.commit_delay:
             self.network.at(self.network.now + self.commit_delay, commit)
         else:
             commit()
 
+    def _say(self, connection: bytes, count: int) -> None:
+        if self.server.writable(connection, 4):
+            self.server.send(connection, count.to_bytes(4, "big"))
+
 
 class RobotProgram:
-    """Sends `messages`, each until it is answered."""
+    """Sends `messages`, each until it is stored."""
 
     def __init__(
         self,
@@ -154,9 +157,10 @@ class RobotProgram:
         self.network = network
         self.who = who
         self.config = config
-        self.to_send = list(messages)
-        self.asked: dict[int, bytes] = {}
-        self.answered: list[bytes] = []
+        self.messages = list(messages)
+        self.sent: int | None = None
+        self.stored = 0
+        self.session_stored = 0
         self.events: list[Event] = []
         self.broken: list[str] = []
         self.host = network.attach(self._start(), address, self.on_event)
@@ -167,45 +171,48 @@ class RobotProgram:
         return self.host.endpoint
 
     def _start(self) -> Client:
+        self.sent = None
         client = make_client(self.network.now, self.config, self.who)
         client.connect(SERVER_ADDRESS, self.network.now)
         return client
 
     def restart(self) -> None:
-        """The process dies and comes back; its spool remembers what was not answered."""
-        self.to_send = list(self.asked.values()) + self.to_send
-        self.asked = {}
+        """The process dies and comes back."""
         self.host.endpoint = self._start()
 
     def feed(self) -> None:
-        client = self.client
-        while self.to_send and client.writable(self.network.now, len(self.to_send[0])):
-            payload = self.to_send.pop(0)
-            try:
-                self.asked[client.send(payload, priority=len(payload) % 2)] = payload
-            except (Full, NotConnected) as error:
-                self.broken.append(f"send refused what writable promised: {error}")
+        """Send what the session takes."""
+        while self.sent is not None and self.sent < len(self.messages):
+            payload = self.sent.to_bytes(4, "big") + self.messages[self.sent]
+            if not self.client.writable(self.network.now, len(payload)):
+                break
+            self.client.send(payload)
+            self.client.expecting(True)
+            self.sent += 1
 
     def on_event(self, event: Event) -> None:
         match event:
-            case MessageAnswered(message_id, payload):
-                question = self.asked.pop(message_id, None)
-                if question is None:
-                    self.broken.append(f"message {message_id} was answered twice or never asked")
-                elif payload != answer_to(question):
-                    self.broken.append(f"message {message_id} got another's answer")
-                else:
-                    self.answered.append(question)
-            case Disconnected(unanswered=unanswered):
-                if list(unanswered) != sorted(self.asked):
-                    self.broken.append("the unanswered messages are not those without an answer")
-                self.to_send = [self.asked[i] for i in unanswered] + self.to_send
-                self.asked = {}
+            case Message(payload=payload):
+                stored = int.from_bytes(payload, "big")
+                if self.sent is None:
+                    self.sent = self.session_stored = stored
+                if stored < self.session_stored:
+                    self.broken.append(f"{stored} came after {self.session_stored}")
+                self.stored = self.session_stored = stored
+                self.client.progressed()
+                self.client.expecting(stored < self.sent)
+            case Connected():
+                self.sent = None
+                self.client.send(b"?")
+                self.client.expecting(True)
                 self.events.append(event)
-            case Connected() | HandshakeFailed() | AddressChanged():
+            case Disconnected():
+                self.sent = None
+                self.events.append(event)
+            case _:
                 self.events.append(event)
         self.feed()
 
     @property
     def done(self) -> bool:
-        return not self.to_send and not self.asked
+        return self.stored == len(self.messages)

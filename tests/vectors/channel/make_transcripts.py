@@ -1,4 +1,4 @@
-"""Makes transcripts.json beside it: two whole handshakes and a message, with every secret that went into them.
+"""Makes transcripts.json beside it: a whole handshake of each mode and a message, with every secret that went into them.
 
 Run from the repository: PYTHONPATH=src:tests python tests/vectors/channel/make_transcripts.py
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bridge.channel.steps import HERE, Steps
-from bridge.channel.world import SERVER_ADDRESS, hub, make_client, make_server, robot
+from bridge.channel.world import SERVER_ADDRESS, hub, make_client, make_server, robot, wall
 from rosbridge_eth.channel import ClientConfig, Mode, Randomness, ServerConfig, handshake
 from smcrypto import sm2
 
@@ -70,7 +70,7 @@ def transcript(mode: Mode) -> dict[str, Any]:
     (shared, digest), again = captured
     if (shared, digest) != again:
         raise RuntimeError("the two ends do not agree")
-    steps.client.send(b"the first message", priority=0)
+    steps.client.send(b"the first message")
     [(message, _)] = steps.client.datagrams_to_send(steps.now)
     server_secrets = real(shared, digest, mode)
     return {
@@ -92,6 +92,7 @@ def transcript(mode: Mode) -> dict[str, Any]:
         "accepted": [data.hex() for data in steps.accepted],
         "message": message.hex(),
         "message_payload": b"the first message".hex(),
+        "server_time_ms": int(wall().timestamp() * 1000),
         "shared": shared.hex(),
         "h3": digest.hex(),
         "client_secret": server_secrets.client.hex(),
