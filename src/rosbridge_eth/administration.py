@@ -155,8 +155,7 @@ def server_trust(home: OperatorHome, registry: Registry) -> ids.Trust:
 
 
 def load_server_identity(home: OperatorHome, passphrase: bytes) -> ids.Identity:
-    identity, _ = ids.load_identity(home.server, passphrase)
-    return identity
+    return ids.load_identity(home.server, passphrase)[0]
 
 
 def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: bytes, now: datetime) -> Path:
@@ -381,18 +380,13 @@ def register_robot(
             peer, files = identity.public, ids.identity_files(identity, [ca.certificate], password)
         else:
             peer = ids.enrol_requests(ca, Role.ROBOT, name, request.signing, request.encryption, at=now)
-            files = {
-                "sign.crt.pem": peer.signing_certificate.to_pem(),
-                "enc.crt.pem": peer.encryption_certificate.to_pem(),
-                "ca.crt.pem": ca.certificate.to_pem(),
-            }
+            files = ids.certificate_files(peer, [ca.certificate])
         number, account, block = _register(registry, ledger, keys, tk, peer.certificates, standing)
         registry.enrol(peer, now, number=number, account=account, replace=replace)
         readers = {reader.name: reader.certificates.decode() for reader in registry.readers()}
-    parts: tuple[dict[str, str], dict[str, str]] = ({}, {})
-    for file, content in files.items():
-        parts[file in ids.KEY_FILES][file] = content.decode()
-    made = Bundle(end, parts[False], readers, parts[True])
+    text = {file: content.decode() for file, content in files.items()}
+    private = {file: text.pop(file) for file in ids.KEY_FILES if file in text}
+    made = Bundle(end, text, readers, private)
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
     funded = True

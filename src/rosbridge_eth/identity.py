@@ -358,17 +358,22 @@ def enrol(ca: CertificateAuthority, role: Role, name: str, *, at: datetime) -> I
 # Files
 
 
+def certificate_files(peer: PeerIdentity, roots: Sequence[x509.Certificate]) -> dict[str, bytes]:
+    """An identity's certificates, and the CA's, as file name → PEM."""
+    return {
+        "sign.crt.pem": peer.signing_certificate.to_pem(),
+        "enc.crt.pem": peer.encryption_certificate.to_pem(),
+        "ca.crt.pem": b"".join(root.to_pem() for root in roots),
+    }
+
+
 def identity_files(
     identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None
 ) -> dict[str, bytes]:
-    """The identity as file name → content; keys are PKCS#8 PEM, encrypted under `password` unless None."""
-    return {
-        "sign.key.pem": identity.signing_key.to_pem(password),
-        "sign.crt.pem": identity.signing_certificate.to_pem(),
-        "enc.key.pem": identity.encryption_key.to_pem(password),
-        "enc.crt.pem": identity.encryption_certificate.to_pem(),
-        "ca.crt.pem": b"".join(root.to_pem() for root in roots),
-    }
+    """An identity as file name → content; keys are PKCS#8 PEM, encrypted under `password` unless None."""
+    keys = (identity.signing_key, identity.encryption_key)
+    private = {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)}
+    return private | certificate_files(identity.public, roots)
 
 
 def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:

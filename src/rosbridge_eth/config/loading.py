@@ -62,8 +62,6 @@ def _read(path: Path, example: str) -> str:
         return path.read_bytes().decode("utf-8-sig")  # some editors begin every file with a byte order mark
     except FileNotFoundError:
         raise ConfigError(f"{path} does not exist; create it, for instance with the line {example}") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path} is a folder; name the file") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not UTF-8 (byte {error.start})") from None
     except OSError as error:
@@ -95,10 +93,6 @@ REMOVED = {
     "commit": "[log] period says what a power cut costs",
     "max_records": "max_size bounds it",
     "batch": "the submitter fills transactions by itself; a robot's [log] period makes chunks larger",
-    "poll": "the node is asked once a block",
-    "bump_after": "what stands still for 30 s is sent again at a higher price, up to max_fee_gwei",
-    "keep": "confirmed chunks stay a day",
-    "remember": "a stream's last number is remembered for good",
 }
 """Keys of the first edition, and what does their work now."""
 

@@ -151,11 +151,11 @@ def test_a_new_ca_may_be_kept_apart_and_half_a_ca_is_told(tmp_path: Path) -> Non
 
 
 def test_the_server_is_renewed_and_the_old_keys_are_kept(world: World) -> None:
-    ca, first = load_ca(world.home.ca, PASSPHRASE, NOW), admin.load_server_identity(world.home, PASSPHRASE)
+    ca, first = load_ca(world.home.ca, PASSPHRASE, NOW), load_identity(world.home.server, PASSPHRASE)[0]
     kept = [admin.renew_server(world.home, ca=ca, passphrase=PASSPHRASE, now=NOW) for _ in range(3)]
     assert len(set(kept)) == 3
     assert load_identity(kept[0], PASSPHRASE)[0].public == first.public
-    now = admin.load_server_identity(world.home, PASSPHRASE)
+    now, _ = load_identity(world.home.server, PASSPHRASE)
     with registry(world) as known:
         assert known.allows(now.public) and not known.allows(first.public)
 
