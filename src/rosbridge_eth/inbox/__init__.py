@@ -20,8 +20,8 @@ from rosbridge_eth.errors import StoreError
 
 DEAD_LETTERS: Final = 1000
 """Dead letters that are kept; the oldest go."""
-_AT_ONCE: Final = 1000
-"""Rows of a robot that one transaction removes."""
+_AT_ONCE: Final = 200
+"""Rows that one transaction removes; on a full disk there is little room for its log."""
 
 
 class InboxExchanged(StoreError):
@@ -64,7 +64,7 @@ class RobotState(NamedTuple):
 
     confirmed: stream and number of the newest row that is confirmed on the chain, and position: where it stands.
     hold: why nothing is written for the robot. certificates_hash: keccak256 of the certificates that the contract
-    has for it. mark: the position that was confirmed at `marked_at`; what lies before it is removed a day later.
+    has for it. mark: a position that was confirmed at `marked_at`, for `forget`.
     """
 
     confirmed: tuple[bytes, int] | None = None
@@ -180,11 +180,14 @@ class Inbox(Protocol):
             self._save(tk, json.dumps(state, default=bytes.hex))
 
     def confirm(self, tk: bytes, position: int | None, now: float) -> None:
-        """The row there and all before it are confirmed on the chain, and none behind it. It may move back."""
+        """The row there and all before it are confirmed on the chain, and none behind it. It may move back.
+
+        To be called at every look at the chain, also where nothing changed.
+        """
         known = self.state(tk)
         if position is None:
             self.set_state(tk, confirmed=None, position=None, mark=None)
-        elif position != known.position:
+        elif position != known.position or known.mark is None:
             header = Chunk.parse(self.chunks(tk, [position])[0]).header
             kept = known.mark is not None and known.mark <= position
             self.set_state(
@@ -216,7 +219,7 @@ class Inbox(Protocol):
         self._put_in_front(tk, front, {*on_chain, *(one.header.digest for one in front)}, now)
 
     def forget(self, before: float) -> None:
-        """Remove rows that were confirmed long before `before` (at most as long again), and make room.
+        """Remove rows that were confirmed before that time, some of them only at twice their age; and make room.
 
         While a robot's rows take more than half of its share, or of its part of a store that is more than half
         full, its oldest confirmed ones go at once. A robot's newest confirmed row stays. To be called every minute
@@ -228,18 +231,20 @@ class Inbox(Protocol):
             kept = min(kept, self.max_bytes // len(sizes) // 2)
         for tk, size in sizes.items():
             state = self.state(tk)
-            aged = state.mark is not None and state.marked_at < before
-            gone: list[int] = []
-            for row in self.rows(tk, None, _AT_ONCE) if state.position is not None and (aged or size > kept) else ():
-                old = aged and state.mark is not None and row.position <= state.mark
-                if row.position == state.position or not (old or size > kept):
-                    break
-                gone.append(row.position)
-                size -= row.size
-            if gone:
+            aged = state.mark if state.mark is not None and state.marked_at < before else None
+            going = state.position is not None and (aged is not None or size > kept)
+            while going and (rows := self.rows(tk, None, _AT_ONCE)):
+                gone: list[int] = []
+                for row in rows:
+                    old = aged is not None and row.position <= aged
+                    going = row.position != state.position and (old or size > kept)
+                    if not going:
+                        break
+                    gone.append(row.position)
+                    size -= row.size
                 self.remove(tk, gone)
-            if aged and len(gone) < _AT_ONCE:
-                self.set_state(tk, mark=state.position, marked_at=before)
+            if aged is not None:
+                self.set_state(tk, mark=None)
 
     def bury(self, tk: bytes, after: int | None, why: str) -> int:
         """Rows behind a position (None: all) become dead letters; how many."""

@@ -219,7 +219,10 @@ def test_what_was_confirmed_is_kept_for_the_time_and_the_newest_one_longer(inbox
     assert held(inbox) == made[:4]
     inbox.confirm(A, position_of(inbox, made[3]), T0 + 150)
     inbox.forget(T0 + 101)
-    assert held(inbox) == made[2:4]  # what stood before the one that was confirmed at 100, and it
+    assert held(inbox) == made[2:4]  # what was confirmed at 100
+    inbox.confirm(A, position_of(inbox, made[3]), T0 + 160)
+    inbox.forget(T0 + 160)
+    assert held(inbox) == made[2:4]
     inbox.forget(T0 + 1000)
     inbox.forget(T0 + 3000)
     assert held(inbox) == made[3:4]
@@ -653,8 +656,10 @@ class Model(RuleBasedStateMachine):
 
     @rule()
     def forget_everything_that_may_be(self) -> None:
-        for _ in range(2):
-            self.inbox.forget(T0 + 1e6)
+        for tk, last in self.confirmed.items():
+            if last is not None:
+                self.inbox.confirm(tk, rows(self.inbox, tk)[self._index(tk, last)].position, T0)
+        self.inbox.forget(T0 + 1e6)
         for tk, last in self.confirmed.items():
             if last is not None:
                 self.rows[tk] = self.rows[tk][self._index(tk, last) :]
