@@ -13,27 +13,23 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger.transport import (
     AlreadyKnown,
-    ChainUnavailable,
+    Node,
     NonceTooLow,
     Reverted,
     TooMuch,
     Underpriced,
-    classify,
-    limit_recursion,
-    printable,
-    session,
-    shown,
+    bytes32,
+    natural,
 )
 
 if TYPE_CHECKING:
@@ -44,8 +40,8 @@ BALANCE_LIMIT = 5 * WEI_PER_ETH  # allocETH does not go beyond it
 NOTHING = bytes(32)  # the tail of a robot that wrote no chunk
 PAGE = 500  # robots in one `standings`
 SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
-BATCH = 50  # requests in one HTTP request
-BATCH_BYTES = 4 * 2**20  # geth takes 5 MiB
+_Event = TypeVar("_Event")
+_Maker = Callable[[Any, Any], _Event]
 
 
 class Standing(NamedTuple):
@@ -164,23 +160,12 @@ class Ledger:
 
     def __init__(self, where: Any, contract: str, place: Place | None = None, *, timeout: float = 10.0) -> None:
         """where: a URL, or a provider of web3 (nodes.embedded). timeout: seconds for one answer."""
-        from web3 import HTTPProvider, Web3
-        from web3.middleware import ExtraDataToPOAMiddleware
-
-        limit_recursion()
-        if isinstance(where, str):
-            self.url = shown(where)
-            options = {"timeout": timeout, "allow_redirects": False}
-            where = HTTPProvider(where, options, session(), exception_retry_configuration=None)
-        else:
-            self.url = "embedded"
-        where.global_ccip_read_enabled = False  # EIP-3668: a node's error would have us fetch any URL it names
-        # The default middleware asks for the chain id before every call, and wraps every answer.
-        self.w3 = Web3(where, middleware=[ExtraDataToPOAMiddleware])
-        with self._asking():
-            self.contract: str = Web3.to_checksum_address(contract)
+        self._node = Node(where, timeout, artifact()["abi"])
+        self.url, self._w3 = self._node.url, self._node.w3
         self._place, self._checked = place, False
-        self._contract: Any = self.w3.eth.contract(address=self.w3.to_checksum_address(contract), abi=artifact()["abi"])
+        with self._node.asking():
+            self._contract: Any = self._w3.eth.contract(self._w3.to_checksum_address(contract), abi=artifact()["abi"])
+        self.contract: str = self._contract.address
 
     @staticmethod
     def connect(where: Any, place: Place, *, timeout: float = 10.0) -> Ledger:
@@ -200,8 +185,8 @@ class Ledger:
         """ChainError unless the node has this contract, on the chain where it was deployed. Asks the node once."""
         if self._checked:
             return
-        with self._asking():
-            chain_id = self.w3.eth.chain_id
+        with self._node.asking():
+            chain_id = self._w3.eth.chain_id
         here, right = (chain_id, self.block(0).hash), (self.chain_id, self.genesis)
         if here != right:
             raise ChainError(
@@ -215,10 +200,7 @@ class Ledger:
         self._checked = True
 
     def close(self) -> None:
-        with self._asking():
-            manager = getattr(self.w3.provider, "_request_session_manager", None)
-            if manager is not None:
-                manager._explicit_session.close()
+        self._node.close()
 
     # ------------------------------------------------------------------ the chain
 
@@ -226,8 +208,8 @@ class Ledger:
     def chain_id(self) -> int:
         if self._place is not None:
             return self._place.chain_id
-        with self._asking():
-            return _natural(self.w3.eth.chain_id)
+        with self._node.asking():
+            return natural(self._w3.eth.chain_id)
 
     @cached_property
     def genesis(self) -> bytes:
@@ -242,50 +224,52 @@ class Ledger:
     @property
     def code(self) -> bytes:
         """What is at the contract's address."""
-        with self._asking():
-            return bytes(self.w3.eth.get_code(self._contract.address))
+        with self._node.asking():
+            return bytes(self._w3.eth.get_code(self._contract.address))
 
     def block(self, number: int | str = "latest") -> Block:
-        with self._asking():
-            got: Any = self.w3.eth.get_block(number)  # type: ignore[arg-type]
+        with self._node.asking():
+            got: Any = self._w3.eth.get_block(number)  # type: ignore[arg-type]
             fee = got.get("baseFeePerGas")
             found = Block(
-                _natural(got["number"]),
-                _natural(got["timestamp"]),
-                _bytes32(got["hash"]),
-                _natural(got["gasLimit"]),
-                None if fee is None else _natural(fee, 2**128),
+                natural(got["number"]),
+                natural(got["timestamp"]),
+                bytes32(got["hash"]),
+                natural(got["gasLimit"]),
+                None if fee is None else natural(fee, 2**128),
             )
             if number not in ("latest", found.number):
                 raise ValueError(f"block {found.number} in place of block {number}")
             return found
 
     def block_number(self) -> int:
-        with self._asking():
-            return _natural(self.w3.eth.block_number)
+        with self._node.asking():
+            return natural(self._w3.eth.block_number)
 
     def block_time(self, number: int) -> int:
         """UTC seconds."""
         return self.block(number).time
 
     def balance(self, account: str) -> int:
-        with self._asking():
-            return _natural(self.w3.eth.get_balance(self.w3.to_checksum_address(account)), 2**256)
+        with self._node.asking():
+            return natural(self._w3.eth.get_balance(self._w3.to_checksum_address(account)), 2**256)
 
     def nonces(self, accounts: Sequence[str]) -> list[tuple[int, int]]:
         """For each account how many transactions are in blocks, and how many with those that wait in the pool."""
         asked = [("eth_getTransactionCount", [a, tag]) for a in accounts for tag in ("latest", "pending")]
-        answers = self._many(asked)
-        with self._asking():
-            counts = [_natural(_required(answer)) for answer in answers]
+        answers = self._node.many(asked)
+        with self._node.asking():
+            if refused := [answer for answer in answers if isinstance(answer, ChainError)]:
+                raise refused[0]
+            counts = [natural(answer) for answer in answers]
         return list(zip(counts[::2], counts[1::2], strict=True))
 
     def fees(self, head: Block) -> Fees:
         """Enough for six full blocks in a row: the base fee rises by at most 1/8 a block, and 1.125**6 > 2."""
-        with self._asking():
+        with self._node.asking():
             if head.base_fee is None:
-                return Fees(_natural(self.w3.eth.gas_price, 2**128), None)
-            tip = _natural(self.w3.eth.max_priority_fee, 2**128)
+                return Fees(natural(self._w3.eth.gas_price, 2**128), None)
+            tip = natural(self._w3.eth.max_priority_fee, 2**128)
             return Fees(2 * head.base_fee + tip, tip)
 
     # ------------------------------------------------------------------ what the contract says
@@ -296,8 +280,8 @@ class Ledger:
         for start in range(0, len(tks), PAGE):
             page = tks[start : start + PAGE]
             answer = self._read("standings", list(page), block=block)
-            with self._asking():
-                rows = [_standing(*row) for row in answer]
+            with self._node.asking():
+                rows = [_standing(row) for row in answer]
                 if len(rows) != len(page):
                     raise ValueError(f"{len(rows)} standings for {len(page)} robots")
             found += rows
@@ -311,7 +295,7 @@ class Ledger:
         return str(self._read("operator"))
 
     def _read(self, function: str, *arguments: Any, block: int | str = "latest") -> Any:
-        with self._asking():
+        with self._node.asking():
             return self._contract.functions[function](*arguments).call(block_identifier=block)
 
     # ------------------------------------------------------------------ events
@@ -357,7 +341,7 @@ class Ledger:
         found: list[RegistrationEvent] = []
         block = standing.changed_block
         while block > 0:
-            page = [_registration(*event) for event in self._events(("Registered", "Revoked"), tk, block, block)]
+            page = self._events({"Registered": _registered, "Revoked": _revoked}, tk, block, block)
             if not page or page[0].previous_block >= block:
                 raise ChainError(f"{self.url} has no registration of this robot in block {block}, where one must be")
             found = page + found
@@ -365,29 +349,25 @@ class Ledger:
         return found
 
     def _data(self, tk: bytes, start: int, end: int) -> list[DataEvent]:
-        return [_data_event(*event) for event in self._events(("Data",), tk, start, end)]
+        return self._events({"Data": _data_event}, tk, start, end)
 
-    def _events(
-        self, names: Sequence[str], tk: bytes, start: int, end: int
-    ) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
-        """(name, arguments, log) of the robot's events of these names in these blocks, in their order."""
-        events = {_bytes32(self._contract.events[name]().topic): self._contract.events[name]() for name in names}
-        with self._asking():
-            logs: Any = self.w3.eth.get_logs(
-                {
-                    "address": self._contract.address,
-                    "topics": [["0x" + topic.hex() for topic in events], "0x" + tk.hex()],
-                    "fromBlock": start,
-                    "toBlock": end,
-                }
-            )
+    def _events(self, makers: Mapping[str, _Maker[_Event]], tk: bytes, start: int, end: int) -> list[_Event]:
+        """The robot's events of these names in these blocks, in their order, as `makers` make them of (args, log)."""
+        events = {self._contract.events[name]().topic: name for name in makers}
+        wanted: Any = {
+            "address": self.contract, "topics": [list(events), "0x" + tk.hex()],
+            "fromBlock": start, "toBlock": end,
+        }  # fmt: skip
+        with self._node.asking():
             found = []
+            logs: Any = self._w3.eth.get_logs(wanted)
             for log in sorted(logs, key=lambda log: (log["blockNumber"], log["logIndex"])):
-                event = events[_bytes32(log["topics"][0])].process_log(log)
-                right = log["address"] == self._contract.address and start <= log["blockNumber"] <= end
-                if not right or event["args"]["Tk"] != tk:
+                name = events["0x" + bytes32(log["topics"][0]).hex()]
+                args = self._contract.events[name]().process_log(log)["args"]
+                here = log["address"] == self.contract and start <= log["blockNumber"] <= end
+                if not here or args["Tk"] != tk:
                     raise ValueError("an event that was not asked for")
-                found.append((event["event"], event["args"], log))
+                found.append(makers[name](args, log))
             return found
 
     # ------------------------------------------------------------------ transactions
@@ -401,28 +381,28 @@ class Ledger:
 
     def send(self, raws: Sequence[bytes]) -> list[ChainError | None]:
         """Hand signed transactions to the node; for each None, or why it was refused."""
-        answers = self._many([("eth_sendRawTransaction", ["0x" + raw.hex()]) for raw in raws])
+        answers = self._node.many([("eth_sendRawTransaction", ["0x" + raw.hex()]) for raw in raws])
         return [answer if isinstance(answer, ChainError) else None for answer in answers]
 
     def call(self, account: str, data: bytes, *, value: int = 0, gas: int | None = None) -> None:
         """Try a transaction without sending it; Reverted with the contract's error if it would fail."""
-        transaction: Any = {"from": account, "to": self._contract.address, "data": "0x" + data.hex(), "value": value}
-        with self._asking():
-            self.w3.eth.call(transaction | ({} if gas is None else {"gas": gas}))
+        transaction: Any = {"from": account, "to": self.contract, "data": "0x" + data.hex(), "value": value}
+        with self._node.asking():
+            self._w3.eth.call(transaction | ({} if gas is None else {"gas": gas}))
 
     def receipt(self, transaction: bytes) -> Receipt | None:
         """The outcome of a transaction that is in a block."""
         from web3.exceptions import TransactionNotFound
 
-        with self._asking():
+        with self._node.asking():
             try:
-                got: Any = self.w3.eth.get_transaction_receipt("0x" + transaction.hex())  # type: ignore[arg-type]
+                got: Any = self._w3.eth.get_transaction_receipt("0x" + transaction.hex())  # type: ignore[arg-type]
             except TransactionNotFound:
                 return None
             if got.get("blockNumber") is None:
                 return None
             return Receipt(
-                transaction, _natural(got["blockNumber"]), got["status"] == 1, _natural(got["gasUsed"]),
+                transaction, natural(got["blockNumber"]), got["status"] == 1, natural(got["gasUsed"]),
                 got.get("contractAddress"),
             )
 
@@ -499,137 +479,31 @@ class Ledger:
             "look whether the chain makes blocks and whether the fee is enough, then look again"
         )
 
-    # ------------------------------------------------------------------ requests
-
-    def _many(self, requests: Sequence[tuple[str, list[Any]]]) -> list[Any]:
-        """The answers to many requests in few HTTP requests; a ChainError in the place of one that was refused."""
-        provider: Any = self.w3.provider
-        answers: list[Any] = []
-        for page in _pages(requests):
-            with self._asking():
-                got = provider.make_batch_request(page)
-                if not isinstance(got, list) or len(got) != len(page):
-                    raise self._error(got.get("error", "no batches") if isinstance(got, dict) else "a wrong count")
-                answers += [self._error(answer["error"]) if "error" in answer else answer["result"] for answer in got]
-        return answers
-
-    @contextmanager
-    def _asking(self) -> Iterator[None]:
-        """What web3, requests or our own checks make of a node's answer becomes a ChainError."""
-        import requests
-        from web3.exceptions import ContractLogicError, Web3RPCError
-
-        try:
-            yield
-        except ChainError:
-            raise
-        except ContractLogicError as error:
-            raise self._error({"message": "execution reverted: " + str(error.message), "data": error.data}) from error
-        except Web3RPCError as error:
-            raise self._error((error.rpc_response or {}).get("error", str(error))) from error
-        except requests.RequestException as error:
-            raise ChainUnavailable(f"{self.url} does not answer: {_reason(error)}") from error
-        except Exception as error:  # a stranger's words went through five libraries, each with errors of its own
-            raise ChainUnavailable(
-                f"{self.url} gave an answer that cannot be used: {printable(error) or type(error).__name__}"
-            ) from error
-
-    def _error(self, error: Any) -> ChainError:
-        """The error object of a JSON-RPC answer."""
-        message, data = (error.get("message"), error.get("data")) if isinstance(error, dict) else (error, None)
-        found = classify(message)
-        if isinstance(found, Reverted):
-            return self._revert(data) or Reverted(f"the contract refuses: {printable(message)}")
-        return type(found)(f"{self.url}: {found}")
-
-    def _revert(self, data: Any) -> Reverted | None:
-        """The contract's own error, where `data` holds one."""
-        from eth_abi.abi import decode
-        from eth_abi.exceptions import DecodingError
-        from web3 import Web3
-
-        if isinstance(data, dict):
-            data = data.get("data")
-        try:
-            code = bytes.fromhex(str(data).removeprefix("Reverted ").removeprefix("0x"))
-            for item in artifact()["abi"]:
-                types = [entry["type"] for entry in item.get("inputs", ())]
-                if item["type"] == "error" and Web3.keccak(text=f"{item['name']}({','.join(types)})")[:4] == code[:4]:
-                    values = decode(types, code[4:])
-                    named = zip((entry["name"] for entry in item["inputs"]), values, strict=True)
-                    words = ", ".join(f"{n} 0x{v.hex()}" if isinstance(v, bytes) else f"{n} {v}" for n, v in named)
-                    return Reverted(f"the contract refuses: {item['name']}({words})", item["name"], values)
-        except (DecodingError, ValueError):
-            pass
-        return None
-
 
 # ---------------------------------------------------------------------- forms of answers
 
 
-def _natural(value: Any, end: int = 2**63) -> int:
-    number = int(value, 16) if isinstance(value, str) else value
-    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < end:
-        raise ValueError(f"{printable(value, 40)} where a number was expected")
-    return number
+def _standing(row: Any) -> Standing:
+    account, certificates_hash, revoked, chunks, tail, balance, data_block, changed_block = row
+    return Standing(
+        account if int(account, 16) else None, certificates_hash, revoked, natural(chunks), tail, balance,
+        natural(data_block), natural(changed_block),
+    )  # fmt: skip
 
 
-def _bytes32(value: Any) -> bytes:
-    found = bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
-    if len(found) != 32:
-        raise ValueError(f"{len(found)} bytes where 32 were expected")
-    return found
-
-
-def _required(answer: Any) -> Any:
-    if isinstance(answer, ChainError):
-        raise answer
-    return answer
-
-
-def _standing(
-    account: str, certificates_hash: bytes, revoked: bool, chunks: int, tail: bytes, balance: int,
-    data_block: int, changed_block: int,
-) -> Standing:
-    numbers = (_natural(chunks), tail, balance, _natural(data_block), _natural(changed_block))
-    return Standing(account if int(account, 16) else None, certificates_hash, revoked, *numbers)
-
-
-def _data_event(_: str, args: dict[str, Any], log: dict[str, Any]) -> DataEvent:
+def _data_event(args: Any, log: Any) -> DataEvent:
     return DataEvent(
-        args["first"], args["previousBlock"], tuple(args["chunks"]), log["blockNumber"],
-        bytes(log["transactionHash"]), args["account"],
+        natural(args["first"]), natural(args["previousBlock"]), tuple(args["chunks"]), log["blockNumber"],
+        bytes32(log["transactionHash"]), args["account"],
     )  # fmt: skip
 
 
-def _registration(name: str, args: dict[str, Any], log: dict[str, Any]) -> RegistrationEvent:
+def _registered(args: Any, log: Any, *, revoked: bool = False) -> RegistrationEvent:
     return RegistrationEvent(
-        args["account"], args.get("certificates", b""), args["index"], args["previousBlock"], log["blockNumber"],
-        name == "Revoked",
+        args["account"], args.get("certificates", b""), natural(args["index"]), natural(args["previousBlock"]),
+        log["blockNumber"], revoked,
     )  # fmt: skip
 
 
-def _pages(requests: Sequence[tuple[str, list[Any]]]) -> Iterator[list[tuple[Any, list[Any]]]]:
-    page: list[tuple[str, list[Any]]] = []
-    size = 0
-    for request in requests:
-        weight = len(str(request[1][0]))
-        if page and (len(page) == BATCH or size + weight > BATCH_BYTES):
-            yield page
-            page, size = [], 0
-        page.append(request)
-        size += weight
-    if page:
-        yield page
-
-
-def _reason(error: Exception) -> str:
-    """Why there was no answer, in few words: requests' own repeat the address and an object's repr."""
-    import requests
-
-    if isinstance(error, requests.Timeout):
-        return "too slow"
-    if isinstance(error, requests.HTTPError) and error.response is not None:
-        return f"HTTP {error.response.status_code} {printable(error.response.reason, 60)}".strip()
-    words = printable(error, 1000)
-    return "too slow" if "timed out" in words else words.rsplit(": ", 1)[-1].rstrip("')\"")
+def _revoked(args: Any, log: Any) -> RegistrationEvent:
+    return _registered(args, log, revoked=True)

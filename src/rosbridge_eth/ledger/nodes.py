@@ -83,7 +83,7 @@ TOLD_FROM = 256 * 2**20  # bytes of state that are worth a warning, and every do
 
 
 class Anvil:
-    """A running anvil at `url`. Ends with `stop`, or with the `with` block.
+    """A running anvil at `url`. Made by `start`; ends with `stop` or the `with` block.
 
     Where it has a state file, the chain survives. anvil itself would write the file in place, again and again; here it
     is asked for its state and the file exchanged for a new one, so that what is there is whole at every moment.
@@ -102,10 +102,67 @@ class Anvil:
         self._stopped = threading.Event()
         self._saver = threading.Thread(target=self._save_often, daemon=True)
 
+    @staticmethod
+    def start(
+        port: int, *, state: Path | None = None, block_time: float | None = None, log_file: Path | None = None,
+        options: Sequence[str] = (),
+    ) -> Anvil:  # fmt: skip
+        """Start anvil on 127.0.0.1:port and wait until it answers; npx fetches it the first time.
+
+        state: the file that keeps the chain. block_time: seconds between blocks; without it every transaction gets
+        its block at once. log_file: where its output goes (nowhere otherwise). ChainError if it is missing or does
+        not start, or the port is taken.
+        """
+        with socket.socket() as probe:  # otherwise whatever listens there would answer in anvil's place
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another") from error
+        if shutil.which("anvil"):
+            command = ["anvil"]
+        elif shutil.which("npx"):
+            command = ["npx", "--yes", f"@foundry-rs/anvil@{VERSION}"]
+        else:
+            raise ChainError("a local chain needs anvil or, to fetch it, npx (of Node.js); install one of them")
+        command += ["--host", "127.0.0.1", "--port", str(port), *options]
+        if state is not None and state.exists():
+            command += ["--load-state", str(state)]
+        if block_time is not None:
+            command += ["--block-time", f"{block_time:g}"]
+        with (log_file.open("ab") if log_file else open(os.devnull, "wb")) as output:
+            process = subprocess.Popen(  # noqa: S603 - a fixed program, no shell
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+        anvil = Anvil(port, process, state)
+        deadline = time.monotonic() + START_SECONDS
+        while True:
+            try:
+                anvil.ask("eth_chainId")
+                break
+            except ChainError as error:
+                if anvil.running() and time.monotonic() < deadline:
+                    time.sleep(0.05)
+                    continue
+                anvil.kill()
+                raise ChainError(
+                    f"anvil does not start on port {port}; {' '.join(command)} tells why"
+                    + (f"; it may be that {state} is damaged" if state and state.exists() else "")
+                ) from error
+        if state is not None:
+            anvil.save()
+            anvil._saver.start()
+        return anvil
+
+    def fund(self, account: str, eth: int) -> None:
+        """Give an account so much ETH, if it has less."""
+        if int(self.ask("eth_getBalance", account, "latest"), 16) < eth * 10**18:
+            self.ask("anvil_setBalance", account, hex(eth * 10**18))
+
     def ask(self, method: str, *params: Any) -> Any:
         """Any JSON-RPC call, such as anvil's own; ChainError if it gives no result."""
         try:
-            answer: Any = self._provider.make_request(method, params)  # type: ignore[arg-type]
+            answer: Any = self._provider.make_request(method, params)
             return answer["result"]
         except (OSError, ValueError, KeyError) as error:
             raise ChainError(f"anvil does not do {method}: {error}") from error
@@ -166,7 +223,7 @@ class Anvil:
 
     def _signal(self, number: signal.Signals) -> None:
         try:
-            # npx starts anvil as a child of its own: the signal goes to the group that start_anvil() made.
+            # npx starts anvil as a child of its own: the signal goes to the group that start() made.
             os.killpg(self._process.pid, number)
             self._process.wait(STOP_SECONDS)
         except (ProcessLookupError, subprocess.TimeoutExpired):
@@ -191,55 +248,3 @@ def _trimmed(state: dict[str, Any]) -> dict[str, Any]:
     oldest = min(first, key=lambda block: int(block["header"]["timestamp"], 16))
     state["blocks"] = [block for block in state["blocks"] if block is oldest or block not in first]
     return state
-
-
-def start_anvil(
-    port: int, *, state: Path | None = None, block_time: float | None = None, log_file: Path | None = None,
-    options: Sequence[str] = (),
-) -> Anvil:  # fmt: skip
-    """Start anvil on 127.0.0.1:port and wait until it answers; npx fetches it the first time.
-
-    state: the file that keeps the chain. block_time: seconds between blocks; without it every transaction gets its
-    block at once. log_file: where its output goes (nowhere otherwise). ChainError if it is missing or does not start,
-    or the port is taken.
-    """
-    with socket.socket() as probe:  # otherwise whatever listens there would answer in anvil's place
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another one") from error
-    if shutil.which("anvil"):
-        command = ["anvil"]
-    elif shutil.which("npx"):
-        command = ["npx", "--yes", f"@foundry-rs/anvil@{VERSION}"]
-    else:
-        raise ChainError("a local chain needs anvil or, to fetch it, npx (of Node.js); install one of them")
-    command += ["--host", "127.0.0.1", "--port", str(port), *options]
-    if state is not None and state.exists():
-        command += ["--load-state", str(state)]
-    if block_time is not None:
-        command += ["--block-time", f"{block_time:g}"]
-    with (log_file.open("ab") if log_file else open(os.devnull, "wb")) as output:
-        process = subprocess.Popen(  # noqa: S603 - a fixed program, no shell
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-        )
-    anvil = Anvil(port, process, state)
-    deadline = time.monotonic() + START_SECONDS
-    while True:
-        try:
-            anvil.ask("eth_chainId")
-            break
-        except ChainError as error:
-            if anvil.running() and time.monotonic() < deadline:
-                time.sleep(0.05)
-                continue
-            anvil.kill()
-            raise ChainError(
-                f"anvil does not start on port {port}; {' '.join(command)} tells why"
-                + (f"; it may be that {state} is damaged" if state and state.exists() else "")
-            ) from error
-    if state is not None:
-        anvil.save()
-        anvil._saver.start()
-    return anvil

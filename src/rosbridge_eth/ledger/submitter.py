@@ -122,7 +122,6 @@ class Account:
     fees: Fees | None = None  # what those offer
     since: float = 0.0  # of the last progress
     careful: bool = False  # the next batch is tried first
-    poor: bool = False  # a transaction could not be paid for
     hold: str | None = None  # why nothing is written
     walk: Walk | None = None
     new: bytes = b""  # digest of a row that is known not to be on the chain
@@ -365,7 +364,7 @@ class Submitter:
             account.flights, account.careful = [], True
             self.counts["surprises"] += 1
         elif mined:
-            account.careful = account.poor = False
+            account.careful = False
         flown = [row.digest for batch in account.flights for row in batch.rows]
         if flown != [row.digest for row in rows[: len(flown)]]:
             account.flights = []  # the rows are others now
@@ -450,14 +449,12 @@ class Submitter:
         answers = self._ledger.send([raw for _, _, raw in outbox]) if outbox else []
         for (account, offered, _), error in zip(outbox, answers, strict=True):
             match error:
-                case None | AlreadyKnown():
-                    pass
+                case None | AlreadyKnown() | OutOfFunds():
+                    pass  # an account that is out of funds is topped up
                 case NonceTooLow():
                     account.nonce, account.flights = None, []
                 case Underpriced():
                     account.fees = offered.raised()
-                case OutOfFunds():
-                    account.poor = True
                 case _:
                     self.trouble = str(error)
         outbox.clear()
@@ -469,7 +466,7 @@ class Submitter:
         funds, (latest, pending) = self._funds, nonces
         if funds.nonce != latest:
             funds.nonce, funds.since = latest, now
-        poor = [w.standing for w in work if w.standing.balance < self._settings.low_water or self._known[w.tk].poor]
+        poor = [w.standing for w in work if w.standing.balance < self._needs(self._known[w.tk])]
         if self._operator is None or not poor or (pending > latest and not funds.due(now)):
             return
         stuck = pending > latest
@@ -484,16 +481,19 @@ class Submitter:
             if left < 0:
                 self.funds = f"the operator's account {self._operator.address} is empty; pay something into it"
                 break
-            if wei > 0:
-                nonce = latest + len(raws)
-                signed = self._ledger.sign(
-                    self._operator, data, nonce=nonce, gas=call_gas(data), fees=funds.fees, value=wei
-                )
-                raws.append(signed.raw)
+            nonce, gas = latest + len(raws), call_gas(data)
+            raws.append(
+                self._ledger.sign(self._operator, data, nonce=nonce, gas=gas, fees=funds.fees, value=wei).raw
+            )
         self.counts["top-ups"] += len(raws)
         for error in self._ledger.send(raws):
             if error is not None and not isinstance(error, AlreadyKnown):
                 self.funds = str(error)
+
+    def _needs(self, account: Account) -> int:
+        """Below which balance an account is topped up: low water, or what is in flight at the highest price."""
+        cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
+        return min(max(self._settings.low_water, cost), BALANCE_LIMIT // 2)
 
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:

@@ -22,6 +22,8 @@ import re
 import socket
 import sys
 import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -33,6 +35,8 @@ from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 from rosbridge_eth.errors import ChainError
 
 MAX_ANSWER = 64 * 2**20  # bytes; the events of a full block are a tenth of it
+BATCH = 50  # requests in one HTTP request
+BATCH_BYTES = 4 * 2**20  # geth takes 5 MiB
 _PIECE = 64 * 1024
 
 
@@ -204,3 +208,123 @@ def session(limit: int = MAX_ANSWER) -> requests.Session:
     made.mount("http://", adapter)
     made.mount("https://", adapter)
     return made
+
+
+# ---------------------------------------------------------------------- requests
+
+
+class Node:
+    """web3 on a node, without the middleware that asks for the chain id before every call and wraps every answer."""
+
+    def __init__(self, where: Any, timeout: float, abi: Sequence[Mapping[str, Any]]) -> None:
+        """where: a URL, or a provider of web3. abi: of the contract whose errors are told by name."""
+        from web3 import HTTPProvider, Web3
+        from web3.middleware import ExtraDataToPOAMiddleware
+
+        limit_recursion()
+        self._abi, self._session, self.url = abi, None, "embedded"
+        if isinstance(where, str):
+            self.url, self._session = shown(where), session()
+            options = {"timeout": timeout, "allow_redirects": False}
+            where = HTTPProvider(where, options, self._session, exception_retry_configuration=None)
+        where.global_ccip_read_enabled = False  # EIP-3668: a node's error would have us fetch any URL it names
+        self.w3 = Web3(where, middleware=[ExtraDataToPOAMiddleware])
+
+    def close(self) -> None:
+        if self._session is not None:
+            self._session.close()
+
+    def many(self, requests: Sequence[tuple[str, list[Any]]]) -> list[Any]:
+        """The answers to many requests in few HTTP requests; a ChainError in the place of one that was refused."""
+        answers: list[Any] = []
+        for page in _pages(requests):
+            with self.asking():
+                got: Any = self.w3.provider.make_batch_request(page)  # type: ignore[attr-defined]
+                if not isinstance(got, list) or len(got) != len(page):
+                    raise self._error(got.get("error", "no batches") if isinstance(got, dict) else "a wrong count")
+                answers += [self._error(answer["error"]) if "error" in answer else answer["result"] for answer in got]
+        return answers
+
+    @contextmanager
+    def asking(self) -> Iterator[None]:
+        """What web3, requests or our own checks make of a node's answer becomes a ChainError."""
+        from web3.exceptions import ContractLogicError, Web3RPCError
+
+        try:
+            yield
+        except ChainError:
+            raise
+        except ContractLogicError as error:
+            raise self._error({"message": f"execution reverted: {error.message}", "data": error.data}) from error
+        except Web3RPCError as error:
+            raise self._error((error.rpc_response or {}).get("error", str(error))) from error
+        except requests.RequestException as error:
+            raise ChainUnavailable(f"{self.url} does not answer: {_reason(error)}") from error
+        except Exception as error:  # a stranger's words went through five libraries, each with errors of its own
+            words = printable(error) or type(error).__name__
+            raise ChainUnavailable(f"{self.url} gave an answer that cannot be used: {words}") from error
+
+    def _error(self, error: Any) -> ChainError:
+        """The error object of a JSON-RPC answer."""
+        message, data = (error.get("message"), error.get("data")) if isinstance(error, dict) else (error, None)
+        found = classify(message)
+        if isinstance(found, Reverted):
+            return self._reverted(data) or Reverted(f"the contract refuses: {found}")
+        return type(found)(f"{self.url}: {found}")
+
+    def _reverted(self, data: Any) -> Reverted | None:
+        """The contract's own error, where `data` holds one."""
+        from eth_abi.abi import decode
+        from eth_abi.exceptions import DecodingError
+        from eth_utils.crypto import keccak
+
+        try:
+            code = bytes.fromhex(str(data.get("data") if isinstance(data, dict) else data).removeprefix("0x"))
+            for item in self._abi:
+                types = [entry["type"] for entry in item.get("inputs", ())]
+                if item["type"] == "error" and keccak(text=f"{item['name']}({','.join(types)})")[:4] == code[:4]:
+                    values = decode(types, code[4:])
+                    named = zip((entry["name"] for entry in item["inputs"]), values, strict=True)
+                    words = ", ".join(f"{n} 0x{v.hex()}" if isinstance(v, bytes) else f"{n} {v}" for n, v in named)
+                    return Reverted(f"the contract refuses: {item['name']}({words})", item["name"], values)
+        except (DecodingError, ValueError):
+            pass
+        return None
+
+
+def _pages(requests: Sequence[tuple[str, list[Any]]]) -> Iterator[list[tuple[Any, list[Any]]]]:
+    page: list[tuple[str, list[Any]]] = []
+    size = 0
+    for request in requests:
+        weight = len(str(request[1][0]))
+        if page and (len(page) == BATCH or size + weight > BATCH_BYTES):
+            yield page
+            page, size = [], 0
+        page.append(request)
+        size += weight
+    if page:
+        yield page
+
+
+def _reason(error: requests.RequestException) -> str:
+    """Why there was no answer, in few words: requests' own repeat the address and an object's repr."""
+    if isinstance(error, requests.HTTPError) and error.response is not None:
+        return f"HTTP {error.response.status_code} {printable(error.response.reason, 60)}".strip()
+    words = printable(error, 1000)
+    return "too slow" if "timed out" in words else words.rsplit(": ", 1)[-1].rstrip("')\"")
+
+
+def natural(value: Any, end: int = 2**63) -> int:
+    """A number below `end`, or hexadecimal for one; else ValueError."""
+    number = int(value, 16) if isinstance(value, str) else value
+    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < end:
+        raise ValueError(f"{printable(value, 40)} where a number was expected")
+    return number
+
+
+def bytes32(value: Any) -> bytes:
+    """32 bytes, or hexadecimal for them; else ValueError or TypeError."""
+    found = bytes.fromhex(value.removeprefix("0x")) if isinstance(value, str) else bytes(value)
+    if len(found) != 32:
+        raise ValueError(f"{len(found)} bytes where 32 were expected")
+    return found

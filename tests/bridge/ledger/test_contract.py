@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import pytest
 from eth_utils.crypto import keccak
 
-from bridge.ledger.world import ETH, KEYS, World
+from bridge.ledger.world import ETH, KEYS
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import Ledger, RegistrationEvent
@@ -275,15 +275,15 @@ def test_a_ledger_is_found_again_by_where_it_was_deployed(made: Ledger):
         genesis = "0x" + made.genesis.hex()
         contract = made.contract
 
-    again = Ledger.connect(made.w3.provider, Place)
+    again = Ledger.connect(made._node.w3.provider, Place)
     again.check()
     assert again.ledger == made.ledger
     with pytest.raises(ChainError, match="another chain"):
         Ledger.connect(EmbeddedChain(), Place).check()
     Place.contract = OTHER.address
     with pytest.raises(ChainError, match="no contract"):
-        Ledger.connect(made.w3.provider, Place).check()
-    assert Ledger.connect(made.w3.provider, Place).ledger != made.ledger
+        Ledger.connect(made._node.w3.provider, Place).check()
+    assert Ledger.connect(made._node.w3.provider, Place).ledger != made.ledger
 
 
 def test_blocks_have_numbers_and_times(made: Ledger):
@@ -294,14 +294,13 @@ def test_blocks_have_numbers_and_times(made: Ledger):
         made.block(head.number + 1)
 
 
-def test_a_transaction_that_another_one_overtakes_is_sent_with_the_next_nonce(world: World):
+def test_a_transaction_that_another_one_overtakes_is_sent_with_the_next_nonce(made: Ledger):
     """Two processes that use the operator's account at once."""
-    ledger, real = world.ledger, world.ledger.nonces
-    stale = real([OPERATOR.address])
-    world.ledger.alloc_eth(OPERATOR, world.pen.account.address, 1)
+    real, stale = made.nonces, made.nonces([OPERATOR.address])
+    made.offer_operator(OPERATOR, OTHER.address)
     answers = iter([stale])
-    ledger.nonces = lambda accounts: next(answers, None) or real(accounts)  # type: ignore[method-assign]
-    assert ledger.alloc_eth(OPERATOR, world.pen.account.address, 1).succeeded
+    made.nonces = lambda accounts: next(answers, None) or real(accounts)  # type: ignore[method-assign]
+    assert made.offer_operator(OPERATOR, ROBOT.address).succeeded
 
 
 def test_every_function_event_and_error_is_on_the_page():

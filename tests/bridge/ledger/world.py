@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bridge.ledger.model_chain import ModelChain
 from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.inbox import Outcome
 from rosbridge_eth.inbox.sqlite import SqliteInbox
-from rosbridge_eth.ledger import Keyring, Ledger
-from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.ledger.submitter import Settings, Submitter
 from smcrypto import sm2
 
@@ -28,6 +29,14 @@ class Pen:
         self.log = Log(LEDGER_ID, self.tk)
         self.previous, self.stream, self.number, self.streams = bytes(32), bytes(15) + b"\x01", 0, 1
         self.written: list[Chunk] = []
+
+    @property
+    def digests(self) -> list[bytes]:
+        return [chunk.header.digest for chunk in self.written]
+
+    @property
+    def last(self) -> tuple[bytes, int] | None:
+        return (self.written[-1].header.stream, self.written[-1].header.number) if self.written else None
 
     def restart(self, *, knows_previous: bool = True) -> None:
         self.streams += 1
@@ -49,59 +58,82 @@ class Pen:
 
 
 class World:
-    """A deployed contract, robots registered and funded, an inbox, a submitter; `now` is the time."""
+    """A chain with the contract, robots registered and funded, an inbox, a submitter; `now` is the time."""
 
-    def __init__(self, folder: Path, robots: int = 1, where: Any = None, **settings: Any) -> None:
+    def __init__(self, folder: Path, robots: int = 1, *, wei: int = ETH, ledger: Any = None, **settings: Any) -> None:
+        """ledger: one with the contract; otherwise a model chain (model_chain.py)."""
         self.folder, self.now = folder, 1_700_000_000.0
-        self.chain = where or EmbeddedChain({KEYS.operator.address: 1000 * ETH})
-        self.ledger, self.deployment = Ledger.deploy(self.chain, KEYS.operator)
         self.pens = [Pen(f"robot_{n}", n) for n in range(1, robots + 1)]
         self.settings = Settings(**settings)
         self.inboxes = 0
+        self.chain = ModelChain() if ledger is None else None
+        self.ledger = ledger or self.chain
         for pen in self.pens:
-            self.ledger.registration(KEYS.operator, pen.tk, pen.account.address, b"certificates")
-            self.ledger.alloc_eth(KEYS.operator, pen.account.address, ETH)
+            if self.chain is not None:
+                self.chain.register(pen.tk, pen.account.address, wei)
+            else:
+                self.ledger.registration(KEYS.operator, pen.tk, pen.account.address, b"certificates")
+                self.ledger.alloc_eth(KEYS.operator, pen.account.address, wei)
+        if self.chain is not None:
+            self.chain.state.balances[KEYS.operator.address] = 1000 * ETH
+            self.chain.mine()
         self.new_inbox()
 
     @property
     def pen(self) -> Pen:
         return self.pens[0]
 
+    @property
+    def model(self) -> ModelChain:
+        assert self.chain is not None
+        return self.chain
+
     def new_inbox(self, path: Path | None = None) -> SqliteInbox:
         """An empty one, or the one at `path`, and a submitter that begins with it."""
         self.inboxes += 1
-        path = path or self.folder / f"inbox-{self.inboxes}"
-        self.inbox = SqliteInbox(path, LEDGER_ID, 10**9, 10**8)
-        self.restart()
+        self.inbox_path = path or self.folder / f"inbox-{self.inboxes}"
+        self.inbox = SqliteInbox(self.inbox_path, LEDGER_ID, 10**9, 10**8)
+        self.submitter = self.restart()
         return self.inbox
 
-    def restart(self) -> None:
-        """A new submitter that remembers nothing."""
+    def restart(self) -> Submitter:
+        """A new submitter, which remembers nothing."""
         accounts = {pen.tk: pen.account for pen in self.pens}
         self.submitter = Submitter(
             self.ledger, self.inbox, lambda: [pen.tk for pen in self.pens], accounts.get, KEYS.operator, self.settings
         )
+        return self.submitter
 
-    def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> None:
-        self.inbox.append([((pen or self.pen).tk, chunk) for chunk in chunks], self.now)
+    def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> list[Outcome]:
+        return self.inbox.append([((pen or self.pen).tk, chunk) for chunk in chunks], self.now)
 
-    def turn(self, seconds: float = 1.0) -> float:
+    def turn(self, seconds: float = 1.0, *, mine: int = 0) -> float:
         self.now += seconds
-        return self.submitter.turn(self.now)
+        pause = self.submitter.turn(self.now)
+        if self.chain is not None and mine:
+            self.chain.mine(mine)
+        return pause
 
-    def run(self, turns: int = 30) -> None:
-        """Turns until nothing waits."""
+    def run(self, turns: int = 60) -> None:
+        """Turns, with a block after each, until all robots' chunks are on the chain and confirmed."""
         for _ in range(turns):
-            self.turn()
-            if self.submitter.trouble is None and all(self.on_chain(pen) == pen.written for pen in self.pens):
-                self.turn()
+            self.turn(mine=1)
+            if all(self.on_chain(pen) == pen.digests and self.confirmed(pen) == pen.last for pen in self.pens):
                 return
-        raise AssertionError(f"{self.submitter.trouble} {self.submitter.counts} {self.inbox.state(self.pen.tk)}")
+        states = [self.inbox.state(pen.tk) for pen in self.pens]
+        raise AssertionError(f"{self.submitter.trouble} {self.submitter.counts} {states}")
 
-    def on_chain(self, pen: Pen | None = None) -> list[Chunk]:
+    def confirmed(self, pen: Pen | None = None) -> tuple[bytes, int] | None:
+        return self.inbox.state((pen or self.pen).tk).confirmed
+
+    def hold(self, pen: Pen | None = None) -> str | None:
+        return self.inbox.state((pen or self.pen).tk).hold
+
+    def on_chain(self, pen: Pen | None = None) -> list[bytes]:
+        """The digests of the robot's chunks, in the order of the chain."""
         tk = (pen or self.pen).tk
-        events = list(self.ledger.data_events(tk, 0, self.ledger.block_number()))
-        assert [event.first for event in events] == [
-            sum(len(e.chunks) for e in events[:i]) for i in range(len(events))
-        ]
-        return [Chunk.parse(chunk) for event in events for chunk in event.chunks]
+        [standing] = self.ledger.standings([tk])
+        events = list(self.ledger.newest_data(tk, standing.data_block))[::-1]
+        chunks = [chunk for event in events for chunk in event.chunks]
+        assert len(chunks) == standing.chunks
+        return [Chunk.parse(chunk).header.digest for chunk in chunks]

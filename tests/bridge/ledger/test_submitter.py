@@ -1,0 +1,584 @@
+"""The submitter on a model chain: every chunk once and in order, whatever happens, and nothing wasted."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+
+from bridge.ledger.model_chain import ETH, GWEI
+from bridge.ledger.world import KEYS, Pen, World
+from rosbridge_eth.inbox import Head, Outcome
+from rosbridge_eth.ledger.contract import Fees
+from rosbridge_eth.ledger.submitter import ALL, BATCH_BYTES, IN_FLIGHT, PATIENCE
+
+ROBOT, OPERATOR = KEYS.robot(1).address, KEYS.operator.address
+
+
+def waiting(world: World) -> list[int]:
+    return sorted(world.model.pool.get(ROBOT, {}))
+
+
+def batches(world: World) -> list[int]:
+    """How many chunks each transaction in the pool has."""
+    return [len(tx.call[4]) for _, tx in sorted(world.model.pool.get(ROBOT, {}).items())]
+
+
+def test_chunks_get_there_and_are_confirmed(world: World):
+    world.take(world.pen.chunks(5))
+    world.turn(mine=1)
+    assert world.on_chain() == world.pen.digests
+    assert world.confirmed() is None
+    world.turn()
+    assert world.confirmed() == (world.pen.stream, 4)
+    assert world.inbox.state(world.pen.tk).certificates_hash == world.model.state.standings[world.pen.tk][1]
+    assert world.model.reverted == 0
+
+
+@pytest.mark.parametrize("confirmations", [1, 3])
+def test_a_chunk_is_confirmed_n_blocks_deep(tmp_path: Path, confirmations: int):
+    world = World(tmp_path, confirmations=confirmations)
+    world.model.mine(5)
+    world.take(world.pen.chunks(1))
+    world.turn(mine=1)
+    for _ in range(confirmations - 1):
+        world.turn(mine=1)
+        assert world.confirmed() is None
+    world.turn()
+    assert world.confirmed() == world.pen.last
+
+
+def test_a_node_without_old_states_confirms_nothing_and_says_so(tmp_path: Path):
+    world = World(tmp_path, confirmations=10)
+    world.model.mine(20)
+    world.model.history = 5
+    world.take(world.pen.chunks(1))
+    for _ in range(15):
+        world.turn(mine=1)
+    assert world.on_chain() == world.pen.digests
+    assert world.confirmed() is None
+    assert "missing trie node" in str(world.submitter.unconfirmed)
+
+
+def test_batches_are_full_and_one_is_not(world: World):
+    world.take(world.pen.chunks(200, 8_000))
+    world.turn()
+    assert world.submitter.in_flight == IN_FLIGHT
+    sizes = [sum(map(len, tx.call[4])) for tx in world.model.pool[ROBOT].values()]
+    assert all(BATCH_BYTES - 9_000 < size <= BATCH_BYTES for size in sizes)
+    world.run()
+    assert world.model.reverted == 0
+    world.take(world.pen.chunks(1))
+    world.turn()
+    assert batches(world) == [1]
+    world.take(world.pen.chunks(3))
+    world.turn()
+    assert batches(world) == [1], "it waits until the other one, which is not full, is in a block"
+    world.take(world.pen.chunks(30, 8_000))
+    world.turn()
+    assert len(batches(world)) == 3, "full ones need not wait"
+    world.run()
+
+
+def test_a_small_block_takes_small_batches(tmp_path: Path):
+    world = World(tmp_path)
+    world.model.states[-1].block = world.model.state.block._replace(gas_limit=2_000_000)
+    world.take(world.pen.chunks(10, 8_000))
+    world.turn()
+    assert all(tx.gas <= 1_000_000 for tx in world.model.pool[ROBOT].values())
+    assert sum(tx.gas for tx in world.model.pool[ROBOT].values()) <= 4_000_000
+    world.run()
+
+
+def test_all_robots_together_fill_two_blocks_oldest_rows_first(tmp_path: Path):
+    world = World(tmp_path, robots=3)
+    for pen in reversed(world.pens):
+        world.now += 1
+        world.take(pen.chunks(100, 8_000), pen)
+    world.turn()
+    limit = world.model.state.block.gas_limit
+    pool = {pen: sum(tx.gas for tx in world.model.pool.get(pen.account.address, {}).values()) for pen in world.pens}
+    assert limit < sum(pool.values()) <= 2 * limit
+    assert pool[world.pens[2]] > pool[world.pens[1]] > pool[world.pens[0]]
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_dropped_transactions_are_sent_again(world: World):
+    world.take(world.pen.chunks(60, 8_000))
+    world.turn()
+    assert len(waiting(world)) == 5
+    world.model.drop(ROBOT, 2)
+    world.turn()
+    assert waiting(world) == [0, 1, 2, 3, 4]
+    world.model.drop()
+    world.turn()
+    assert waiting(world) == [0, 1, 2, 3, 4]
+    world.run()
+    assert world.model.reverted == 0
+
+
+@pytest.mark.parametrize("forget", [True, False])
+@pytest.mark.parametrize("depth", [1, 2, 5])
+def test_reorganisations_are_healed(tmp_path: Path, depth: int, forget: bool):
+    """Also deeper than `confirmations`, which are 2 here."""
+    world = World(tmp_path, confirmations=2)
+    for _ in range(6):
+        world.take(world.pen.chunks(2))
+        world.turn(mine=1)
+    before = world.on_chain()
+    world.model.reorg(depth, forget=forget)
+    assert len(world.on_chain()) < len(before)
+    world.take(world.pen.chunks(1))
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_what_is_confirmed_may_move_back(tmp_path: Path):
+    world = World(tmp_path)
+    for _ in range(3):
+        world.take(world.pen.chunks(1))
+        world.turn(mine=1)
+    world.turn()
+    assert world.confirmed() == (world.pen.stream, 2)
+    world.model.reorg(2, forget=True)
+    world.model.pool.clear()
+    world.turn()
+    assert world.confirmed() == (world.pen.stream, 0)
+
+
+def test_a_restart_waits_for_what_is_in_the_pool(world: World):
+    world.take(world.pen.chunks(40, 8_000))
+    world.turn()
+    pool = dict(world.model.pool[ROBOT])
+    world.restart()
+    world.take(world.pen.chunks(1))
+    world.turn()
+    assert world.model.pool[ROBOT] == pool
+    world.model.mine()
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_what_stays_in_the_pool_is_sent_over_after_a_while(world: World):
+    world.take(world.pen.chunks(2))
+    world.turn()
+    world.restart()
+    world.model.base_fee *= 10
+    world.turn(mine=1)
+    world.turn(PATIENCE - 5)
+    assert world.model.pool[ROBOT][0].fees == Fees(3 * GWEI, GWEI)
+    world.turn(10)
+    assert world.model.pool[ROBOT][0].fees.highest >= 20 * GWEI
+    world.run()
+
+
+def test_a_price_that_rises_is_followed_up_to_the_limit(tmp_path: Path):
+    world = World(tmp_path, max_fee=50 * GWEI, low_water=0)
+    world.take(world.pen.chunks(40, 8_000))
+    world.turn()
+    world.model.base_fee *= 10
+    for _ in range(3):
+        world.turn(PATIENCE + 1)
+    fees = {tx.fees for tx in world.model.pool[ROBOT].values()}
+    assert len(fees) == 1
+    assert fees.pop().highest >= 21 * GWEI
+    world.run()
+    world.model.base_fee = 60 * GWEI
+    world.model.mine()
+    world.take(world.pen.chunks(1))
+    for _ in range(5):
+        world.turn(PATIENCE + 1)
+    assert "max_fee_gwei" in str(world.submitter.trouble)
+    world.model.base_fee = GWEI
+    world.model.mine()
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_transactions_of_somebody_else_are_waited_for(world: World):
+    world.take(world.pen.chunks(3))
+    world.turn(mine=1)
+    for _ in range(3):
+        world.model.spend(ROBOT)
+    world.take(world.pen.chunks(3))
+    world.turn()
+    assert [tx.call[0] for tx in world.model.pool[ROBOT].values()] == ["plain"] * 3
+    world.model.mine()
+    world.run()
+    assert world.model.reverted == 0
+    world.take(world.pen.chunks(1))
+    world.turn()
+    world.model.drop()
+    world.model.spend(ROBOT)  # takes the very number of one in flight
+    world.model.mine()
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_an_answer_that_is_lost_is_not_needed(world: World):
+    world.take(world.pen.chunks(3))
+    world.model.mute = True
+    assert world.turn() > 1
+    assert "too slow" in str(world.submitter.trouble)
+    world.model.mute = False
+    world.run()
+    assert world.model.reverted == 0
+    assert world.model.state.nonces[ROBOT] == 1
+
+
+def test_a_node_that_is_away_is_asked_less_and_less_often(world: World):
+    world.model.down = True
+    pauses = [world.turn() for _ in range(8)]
+    assert pauses == sorted(pauses)
+    assert pauses[-1] == 30
+    world.model.down = False
+    world.take(world.pen.chunks(1))
+    world.run()
+    assert world.submitter.trouble is None
+
+
+# ---------------------------------------------------------------------- the inbox is not what it was
+
+
+def copy_inbox(world: World, name: str) -> Path:
+    """The inbox as it is now."""
+    target = world.folder / name
+    world.inbox.close()
+    for suffix in ("", "-wal"):
+        if (path := Path(f"{world.inbox_path}{suffix}")).exists():
+            shutil.copy(path, f"{target}{suffix}")
+    world.new_inbox(world.inbox_path)
+    return target
+
+
+def test_a_lost_inbox_learns_where_the_chain_is(world: World):
+    world.take(world.pen.chunks(30))
+    world.run()
+    world.new_inbox()
+    assert world.take(world.pen.written[:1]) == [Outcome.STORED], "before anybody looked, it cannot know"
+    world.new_inbox()
+    world.turn()
+    assert world.inbox.head(world.pen.tk, world.pen.stream) == Head(29, world.pen.digests[-1])
+    assert set(world.take(world.pen.written)) == {Outcome.KNOWN}
+    world.turn()
+    assert world.confirmed() == world.pen.last
+    world.take(world.pen.chunks(2))
+    world.run()
+    assert world.model.reverted == 0
+
+
+@pytest.mark.parametrize("since", [0, 3, 17, 29, 30])
+def test_chunks_that_a_robot_sends_again_are_not_written_again(world: World, since: int):
+    """It sends everything from number `since` on before the submitter looked."""
+    world.take(world.pen.chunks(20))
+    world.run()
+    world.take(world.pen.chunks(10))
+    world.run()
+    world.new_inbox()
+    world.take(world.pen.written[since:])
+    world.take(world.pen.chunks(2))
+    world.run()
+    assert world.model.reverted == 0
+    assert [row.digest for row in world.inbox.rows(world.pen.tk, None, 99)][-3:] == world.pen.digests[-3:]
+
+
+def test_streams_of_before_that_come_again_are_not_written_again(world: World):
+    """The inbox is lost, and the robot, long without a network, begins with what it has not heard to be confirmed."""
+    for _ in range(4):
+        world.take(world.pen.chunks(3))
+        world.run()
+        world.pen.restart()
+    world.new_inbox()
+    world.turn()
+    assert world.inbox.head(world.pen.tk, (2).to_bytes(16, "big")) is None
+    world.take(world.pen.written[4:])
+    assert len(world.inbox.rows(world.pen.tk, None, 99)) > 1
+    world.take(world.pen.chunks(2))
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_a_stream_that_nothing_leads_to_is_looked_for_once_and_written(world: World):
+    """The robot lost its disk, and the server its inbox: is what it sends on the chain? All is read, then known."""
+    world.take(world.pen.chunks(30))
+    world.run()
+    world.new_inbox()
+    world.turn()
+    world.pen.restart(knows_previous=False)
+    world.take(world.pen.chunks(3))
+    world.run()
+    assert world.inbox.head(world.pen.tk, ALL) is not None
+    walks = world.submitter.counts["walks"]
+    for _ in range(3):
+        world.pen.restart(knows_previous=False)
+        world.take(world.pen.chunks(3))
+        world.run()
+    assert world.submitter.counts["walks"] == walks
+    assert world.model.reverted == 0
+
+
+def test_an_inbox_that_saw_all_from_the_first_chunk_reads_nothing_back(world: World):
+    for _ in range(3):
+        world.take(world.pen.chunks(3))
+        world.run()
+        world.pen.restart(knows_previous=False)
+    assert world.submitter.counts["walks"] == 0
+
+
+def test_an_old_copy_of_the_inbox_is_put_back(world: World):
+    world.take(world.pen.chunks(10))
+    world.run()
+    world.take(world.pen.chunks(5))  # not on the chain when the copy is made
+    old = copy_inbox(world, "old")
+    world.run()
+    world.take(world.pen.chunks(10))
+    world.run()
+    world.inbox.close()
+    world.new_inbox(old)
+    world.turn()
+    assert world.inbox.head(world.pen.tk, world.pen.stream) == Head(24, world.pen.digests[-1])
+    world.take(world.pen.chunks(5))
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_an_old_copy_to_which_the_robot_sends_what_it_lacks(world: World):
+    world.take(world.pen.chunks(10))
+    old = copy_inbox(world, "old")
+    world.run()
+    world.take(world.pen.chunks(10))
+    world.run()
+    world.inbox.close()
+    world.new_inbox(old)
+    world.take(world.pen.written[10:17])
+    world.run()
+    world.take(world.pen.written[17:])
+    world.take(world.pen.chunks(3))
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_a_long_reading_goes_on_in_the_next_turns_and_holds_nobody_up(tmp_path: Path):
+    world = World(tmp_path, robots=2)
+    for _ in range(130):
+        world.take(world.pen.chunks(1))
+        world.turn(mine=1)
+    world.turn()
+    world.new_inbox()
+    world.take(world.pen.written[:1])  # the oldest: everything is to be read
+    other = world.pens[1]
+    world.take(other.chunks(1), other)
+    world.turn(mine=1)
+    assert "being read" in str(world.hold())
+    assert world.on_chain(other) == other.digests
+    world.run()
+    assert world.model.reverted == 0
+
+
+def test_what_another_program_wrote_holds_only_its_robot_up(tmp_path: Path):
+    world = World(tmp_path, robots=2)
+    world.take(world.pen.chunks(1))
+    world.run()
+    standing = world.model.state.standings[world.pen.tk]
+    raw = world.model.sign(
+        KEYS.robot(1), ("setData", world.pen.tk, 1, standing.tail, [b"?"]), nonce=1, gas=10**6, fees=Fees(10**10, 1)
+    )
+    world.model.send([raw.raw])
+    world.model.mine()
+    other = world.pens[1]
+    world.take(world.pen.chunks(1))
+    world.take(other.chunks(1), other)
+    world.turn(mine=1)
+    assert "another program" in str(world.hold())
+    assert world.on_chain(other) == other.digests
+
+
+# ---------------------------------------------------------------------- permission and money
+
+
+def test_a_robot_that_may_not_write_is_on_hold_and_others_go_on(tmp_path: Path):
+    world = World(tmp_path, robots=4)
+    stranger, revoked, moved, fine = world.pens
+    standings = world.model.state.standings
+    del standings[stranger.tk]
+    standings[revoked.tk] = standings[revoked.tk]._replace(revoked=True)
+    standings[moved.tk] = standings[moved.tk]._replace(account=KEYS.robot(9).address)
+    for pen in world.pens:
+        world.take(pen.chunks(2), pen)
+    world.turn(mine=1)
+    world.turn()
+    assert "not registered" in str(world.hold(stranger))
+    assert "revoked" in str(world.hold(revoked))
+    assert "whose key is not here" in str(world.hold(moved))
+    assert world.on_chain(fine) == fine.digests
+    assert world.hold(fine) is None
+    for pen in (stranger, revoked):
+        assert world.inbox.state(pen.tk).certificates_hash == bytes(32), "no certificate is right"
+    standings = world.model.state.standings
+    standings[revoked.tk] = standings[revoked.tk]._replace(revoked=False)
+    world.turn(mine=1)
+    assert world.on_chain(revoked) == revoked.digests
+    world.turn()
+    assert world.hold(revoked) is None
+
+
+def test_a_refusal_costs_one_transaction_and_then_nothing(world: World):
+    """The contract refuses what the submitter has no other way to foresee."""
+    world.take(world.pen.chunks(3))
+    refuse, world.model._refuse = world.model._refuse, lambda *_: exec("raise Reverted('no: Paused()')", globals_)
+    globals_ = vars(__import__("rosbridge_eth.ledger.transport", fromlist=["Reverted"]))
+    for _ in range(200):
+        world.turn(mine=1)
+    assert world.model.reverted == 1
+    assert "Paused" in str(world.hold())
+    world.model._refuse = refuse  # type: ignore[method-assign]
+    world.turn(PATIENCE + 1)
+    world.run()
+    assert world.hold() is None
+
+
+def test_accounts_are_topped_up_once_each(tmp_path: Path):
+    world = World(tmp_path, robots=3, wei=0)
+    for pen in world.pens:
+        world.take(pen.chunks(1), pen)
+    world.turn()
+    assert [tx.call for tx in world.model.pool[OPERATOR].values()] == [
+        ("allocETH", pen.account.address) for pen in world.pens
+    ]
+    for _ in range(3):
+        world.turn()
+    world.run()
+    for pen in world.pens:
+        assert ETH // 2 - ETH // 50 < world.model.balance(pen.account.address) <= ETH // 2
+    assert world.submitter.counts["top-ups"] == 3
+    assert world.model.reverted == 0
+
+
+def test_a_top_up_that_is_stuck_is_raised_and_one_that_was_dropped_sent_again(tmp_path: Path):
+    world = World(tmp_path, wei=0)
+    world.take(world.pen.chunks(1))
+    world.turn()
+    world.model.drop()
+    world.turn()
+    world.model.base_fee *= 20
+    world.turn(mine=1)
+    world.turn(PATIENCE + 1)
+    world.run()
+    assert world.model.balance(ROBOT) <= ETH // 2
+
+
+def test_an_empty_treasury_is_said_and_nothing_is_dropped(tmp_path: Path):
+    world = World(tmp_path, wei=0)
+    world.model.state.balances[OPERATOR] = 0
+    world.take(world.pen.chunks(2))
+    for _ in range(5):
+        world.turn(mine=1)
+    assert "is empty" in str(world.submitter.funds)
+    world.model.state.balances[OPERATOR] = ETH
+    world.run()
+    assert world.submitter.funds is None
+
+
+def test_a_robot_spends_at_most_its_gas_of_a_day(tmp_path: Path):
+    world = World(tmp_path, robots=2, gas_per_day=40_000_000)
+    greedy, modest = world.pens
+    world.take(greedy.chunks(300, 8_000), greedy)
+    world.take(modest.chunks(2), modest)
+    for _ in range(10):
+        world.turn(mine=1)
+    first = sum(tx.gas for s in world.model.states for tx in s.transactions if tx.sender == greedy.account.address)
+    assert first <= 4_000_000, "a tenth of it right after a start"
+    assert world.on_chain(modest) == modest.digests
+    assert "gas_per_day" in str(world.hold(greedy))
+    for _ in range(24 * 6):
+        world.turn(600, mine=1)
+    spent = sum(tx.gas for s in world.model.states for tx in s.transactions if tx.sender == greedy.account.address)
+    assert 36_000_000 < spent <= 44_000_000
+
+
+# ---------------------------------------------------------------------- everything at once
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_whatever_happens_every_chunk_is_written_once_and_in_order(tmp_path: Path, seed: int):
+    """Random faults; the robots send again what they do not know to be taken, as they do (robot.py)."""
+    dice = random.Random(seed)
+    world = World(tmp_path, robots=2, confirmations=3)
+    sent = dict.fromkeys(world.pens, 0)  # how much of each log was offered to this inbox
+    old: Path | None = None
+    rivals: list = []
+
+    def resend(pen: Pen) -> None:
+        """From the oldest chunk that the robot was not told to be confirmed."""
+        told[pen] = max(told[pen], index(pen))
+        outcomes = world.take(pen.written[told[pen] :], pen)
+        assert Outcome.DIFFERENT not in outcomes
+        sent[pen] = len(pen.written)
+
+    def index(pen: Pen) -> int:
+        confirmed = world.confirmed(pen)
+        places = [(c.header.stream, c.header.number) for c in pen.written]
+        return places.index(confirmed) + 1 if confirmed in places else 0
+
+    told = dict.fromkeys(world.pens, 0)
+    for _ in range(120):
+        world.turn(dice.choice([0.3, 1, 1, 5, 40]))
+        for rival in rivals:
+            rival.turn(world.now)
+        match dice.choice("mmmmmmmmwwwwwwdpfrRklocnsu"):
+            case "m":
+                world.model.mine(dice.choice([1, 1, 2]))
+            case "w":
+                pen = dice.choice(world.pens)
+                if dice.random() < 0.2:
+                    pen.restart(knows_previous=dice.random() < 0.8)
+                world.take(pen.chunks(dice.randrange(1, 12), dice.choice([0, 0, 8_000])), pen)
+            case "d":
+                world.model.drop(ROBOT, world.model.state.nonces[ROBOT] + dice.randrange(3))
+            case "p":
+                world.model.drop()
+            case "f":
+                world.model.base_fee = GWEI * dice.choice([1, 1, 3, 20])
+            case "r":
+                world.model.reorg(min(dice.randrange(1, 3), len(world.model.states) - 2), forget=dice.random() < 0.5)
+            case "R":
+                world.model.reorg(min(dice.randrange(3, 8), len(world.model.states) - 2), forget=dice.random() < 0.5)
+            case "k":
+                world.restart()
+            case "l":
+                world.new_inbox()
+                if dice.random() < 0.5:
+                    world.turn()
+                for pen in world.pens:
+                    resend(pen)
+            case "c":
+                old = copy_inbox(world, f"copy-{world.now}")
+            case "o" if old is not None:
+                world.inbox.close()
+                world.new_inbox(old)
+                old = None
+                for pen in world.pens:
+                    resend(pen)
+            case "n":
+                world.model.spend(dice.choice(world.pens).account.address)
+            case "s":
+                first = world.submitter
+                world.restart()
+                rivals = [first] if not rivals else []
+            case "u":
+                world.model.mute = not world.model.mute
+        if dice.random() < 0.3:
+            for pen in world.pens:
+                told[pen] = max(told[pen], index(pen))
+        if world.inbox.id not in {rival._inbox.id for rival in rivals}:
+            rivals = []
+    world.model.mute, world.model.base_fee = False, GWEI
+    for pen in world.pens:
+        resend(pen)
+    for _ in range(60):
+        world.turn(10, mine=1)
+    for pen in world.pens:
+        assert world.on_chain(pen) == pen.digests
