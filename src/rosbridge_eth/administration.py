@@ -267,7 +267,6 @@ def _reader_toml(ledger: Deployment, node: str) -> str:
         f'contract = "{ledger.contract}"\n'
         f"chain_id = {ledger.chain_id}\n"
         f'genesis = "{ledger.genesis}"\n'
-        f"from_block = {ledger.block}\n"
         'ca = "ca.crt.pem"\n'
         'identity = "."\n'
         f'chain = ["{node}"]  # any nodes of this chain\n'

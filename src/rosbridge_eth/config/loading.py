@@ -91,6 +91,7 @@ REMOVED = {
     "acknowledge": "every chunk is kept until it is confirmed on the chain",
     "stream": "a new stream begins at every start, and each chunk has a key of its own; [log] has its period",
     "commit": "[log] period says what a power cut costs",
+    "from_block": "a robot's log is read from its registration on",
     "max_records": "max_size bounds it",
     "batch": "the submitter fills transactions by itself; a robot's [log] period makes chunks larger",
 }

@@ -569,8 +569,6 @@ class ReaderConfig(Section):
 
     chain: JSON-RPC URL of a node of the chain, or a list of them: all are asked, the highest count holds, and where
     they disagree it is told.
-
-    from_block: The block of the contract's deployment, or later; what a robot wrote before it is not read.
     """
 
     contract: ContractAddress
@@ -581,7 +579,6 @@ class ReaderConfig(Section):
     chain: Annotated[list[NodeUrl], BeforeValidator(_listed)] = Field(
         default=["http://127.0.0.1:8545"], min_length=1, repr=False
     )
-    from_block: int = Field(default=0, ge=0)
 
     @property
     def ledger(self) -> bytes:

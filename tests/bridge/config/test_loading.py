@@ -260,6 +260,7 @@ def test_a_reader_says_which_ledger_and_by_which_nodes():
         ('contract = "0x12"', "contract is '0x12'; an address is 0x and 40 hexadecimal digits"),
         ('genesis = "0x12"', "genesis is '0x12'; a hash is 0x and 64 hexadecimal digits"),
         ("chain = []", "chain is empty"),
+        ("from_block = 1", "unknown key 'from_block'; it is gone since the second edition: a robot's log is read"),
         ('chain = ["http://a", "ftp://secretkey@b"]', "chain[1] is not a node's URL"),
     ],
 )

@@ -257,7 +257,7 @@ def test_a_readers_configuration_is_complete_and_tells_no_key_of_the_operators_n
                            chain_url="https://me:word@node.example:8545/v2/secretkey")
     made = admin.deploy_contract(home, EmbeddedChain({keys.operator.address: 10**21}), keys)
     config = load_reader_config(reader.config)
-    assert (config.ledger, config.from_block, config.identity) == (made.ledger, made.block, reader.path)
+    assert (config.ledger, config.identity) == (made.ledger, reader.path)
     assert config.chain == ["https://node.example:8545"]
     assert home.reader_config.read_bytes() == reader.config.read_bytes()
     assert x509.Certificate.from_pem(config.ca.read_bytes())
