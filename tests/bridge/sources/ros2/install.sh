@@ -9,9 +9,5 @@ root=$(cd "$(dirname "$0")/../../../.." && pwd)
 "${PYTHON:-python3}" -m venv "$place"
 "$place/bin/python" -m pip install -q --disable-pip-version-check \
   'ros-rclpy[fastrtps]' ros-std-msgs ros-nav-msgs ros-sensor-msgs ros-test-msgs
-# The bridge's packages, not the bridge: the tests run it from the checkout.
-"$place/bin/python" - "$root/pyproject.toml" <<'END' >"$place/bridge.txt"
-import sys, tomllib
-print(*tomllib.load(open(sys.argv[1], "rb"))["project"]["optional-dependencies"]["bridge"], sep="\n")
-END
-"$place/bin/python" -m pip install -q --disable-pip-version-check -r "$place/bridge.txt"
+# The bridge's packages, and the bridge as it is in the checkout.
+"$place/bin/python" -m pip install -q --disable-pip-version-check -e "$root[bridge]"

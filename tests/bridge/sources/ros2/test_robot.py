@@ -6,40 +6,36 @@ import re
 import signal
 import socket
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
 
 from bridge.sources.ros2.graph import Graph
-from rosbridge_eth.bundle import open_bundle
-from rosbridge_eth.home import OperatorHome, RobotHome
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.embedded import EmbeddedChain
-from rosbridge_eth.records import robot_id
-from rosbridge_eth.robot.assembly import join
-from rosbridge_eth.server.administration import deploy_contract, init_home, load_ca, register_robot
-from rosbridge_eth.store import Spool, SpoolLimits
+from rosbridge_eth import identity as ids
+from rosbridge_eth.bundle import Bundle, ask_to_join, join
+from rosbridge_eth.chunk import Log, content_key, drop, open_lines, robot_id
+from rosbridge_eth.home import BridgeEnd, RobotHome
+from rosbridge_eth.spool import Spool
 
 pytestmark = pytest.mark.service
-PASSPHRASE, PASSWORD = b"operator's", b"robot's"
+PASSWORD = b"robot's"
+END = BridgeEnd("robot_1", "server", "127.0.0.1:9", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+NOW = datetime.now(UTC)
+CA = ids.create_ca("CA", at=NOW)
+READER = ids.enrol(CA, ids.Role.READER, "owner", at=NOW)
 
 
 @pytest.fixture
 def robot(tmp_path: Path) -> RobotHome:
     """The home of a registered robot, whose server is not there."""
-    home, robot, now = OperatorHome(tmp_path / "operator"), RobotHome(tmp_path / "robot"), datetime.now(UTC)
-    init_home(
-        home, PASSPHRASE, listen="127.0.0.1:9", public=None, chain_url="http://127.0.0.1:9", server="server", now=now
-    )
-    keys = Keyring.load(home.accounts, PASSPHRASE)
-    chain = EmbeddedChain(fund={keys.operator.address: 10**21})
-    deploy_contract(home, chain, keys)
-    registered = register_robot(
-        home, "robot_1", ca=load_ca(home, PASSPHRASE), keys=keys, chain=chain, password=PASSWORD, now=now
-    )
-    join(robot, open_bundle(registered.bundle.read_bytes(), PASSWORD), PASSWORD)
-    return robot
+    home = RobotHome(tmp_path / "robot")
+    request = ask_to_join(home, END.robot, PASSWORD)
+    peer = ids.enrol_requests(CA, ids.Role.ROBOT, END.robot, request.signing, request.encryption, at=NOW)
+    certificates = {name: text.decode() for name, text in ids.certificate_files(peer, [CA.certificate]).items()}
+    join(home, Bundle(END, certificates, {"owner": READER.public.pem.decode()}))
+    return home
 
 
 def test_a_robot_with_hardly_a_configuration_records_its_ros_2(ros: Graph, robot: RobotHome, tmp_path):
@@ -56,12 +52,22 @@ def test_a_robot_with_hardly_a_configuration_records_its_ros_2(ros: Graph, robot
     node.order(**{"await": "/robot_1/odom"})
     node.order(burst="/robot_1/odom", count=100, rate=100)
     metrics = f"http://127.0.0.1:{port}/metrics"
-    process.until(lambda: re.search(r"captured\S* 100", urlopen(metrics).read().decode()), "capturing everything")
+    process.until(lambda: re.search(r"captured\S* 100\b", urlopen(metrics).read().decode()), "capturing everything")
     assert process.finish(signal.SIGTERM) == 0
-    process.says("100 captured, 0 stored by the server, ")
-    spool = Spool(robot.spool, robot_id("robot_1"), SpoolLimits())
-    assert spool.statistics.records == 100
+    process.says("100 records captured in ")
+    log = Log(END.ledger, robot_id(END.robot))
+    spool = Spool(robot.spool, log, max_bytes=1 << 30, drop=partial(drop, log, READER.signing_key))
+    stream, _, _ = spool.first_unconfirmed()
+    chunks = spool.following(stream, None, 1 << 24)
+    lines = [
+        line
+        for chunk in chunks
+        for line in open_lines(log, chunk, content_key(chunk.header, READER.encryption_key))
+    ]
     spool.close()
+    assert lines[0].startswith(b'{"stream":{"source":"ros2"')
+    assert lines[1].startswith(b'{"type":"nav_msgs/msg/Odometry","wire":"cdr","format":"msg"')
+    assert sum(line.startswith(b'{"topic":"/robot_1/odom"') for line in lines[2:]) == 100 == len(lines) - 2
 
 
 def test_a_robot_without_rclpy_says_what_to_do(robot: RobotHome, ros: Graph, tmp_path):

@@ -2,7 +2,8 @@
 
 watching.py robot.toml [hold]     with "hold", no message is taken before stdin ends: a robot that is slow
 
-Every line is a JSON object: {"record": ..., "rebuilt": ...}, or at the end {"statistics": ...}. SIGTERM ends it, as it does a robot.
+Every line is a JSON object: {"record": ..., "rebuilt": ...}, or at the end {"statistics": ...}. SIGTERM ends it, as it
+does a robot.
 """
 
 from __future__ import annotations

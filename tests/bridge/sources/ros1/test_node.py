@@ -1,0 +1,315 @@
+"""What our node asks of a master, and whom it is connected to: calls are answered by a script, turn by turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosbridge_eth.sources import Selection, SystemClock
+from rosbridge_eth.sources.backlog import Backlog
+from rosbridge_eth.sources.ros1 import api, node
+from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError
+from rosbridge_eth.sources.ros1.node import Node
+from rosbridge_eth.sources.ros1.publisher import FIRST_RETRY, LAST_RETRY, STEADY, Publisher
+from rosbridge_eth.sources.ros1.tcpros import Publication
+
+API = "http://me:1/"
+
+
+class Script:
+    """A master: `state` is what it says, and `calls` what it was asked since it was last looked at."""
+
+    def __init__(self, subject: Node) -> None:
+        self.subject = subject
+        self.publishers: dict[str, list[str]] = {}  # APIs by topic
+        self.subscribers: dict[str, set[str]] = {}
+        self.apis: dict[str, str] = {}
+        self.calls: list[str] = []
+        self.failure: Exception | None = None
+
+    def __call__(self, endpoint, deadlines, timeout, limit, method, caller, *parameters):
+        self.calls.append(" ".join([method, *(p for p in parameters[:1] if method.endswith("Subscriber"))]))
+        if self.failure is not None:
+            raise self.failure
+        return getattr(self, method)(caller, *parameters)
+
+    def lookupNode(self, _caller, name):
+        if name not in self.apis:
+            raise api.Refusal("unknown node")
+        return self.apis[name]
+
+    def getSystemState(self, _caller):
+        publishers = [[topic, [f"/n_{uri}" for uri in uris]] for topic, uris in self.publishers.items()]
+        return [publishers, [[topic, sorted(nodes)] for topic, nodes in self.subscribers.items()], []]
+
+    def registerSubscriber(self, caller, topic, _type, uri):
+        self.apis[caller] = uri
+        self.subscribers.setdefault(topic, set()).add(caller)
+        return list(self.publishers.get(topic, ()))
+
+    def unregisterSubscriber(self, caller, topic, _uri):
+        self.subscribers.get(topic, set()).discard(caller)
+        return 1
+
+    def turn(self) -> list[str]:
+        """One look; the calls besides those of every look."""
+        self.calls.clear()
+        self.subject._look()
+        return [call for call in self.calls if call not in ("lookupNode", "getSystemState")]
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """Publishers whose threads were started; none runs."""
+    started: list[Publisher] = []
+    monkeypatch.setattr(Publisher, "start", lambda publisher: started.append(publisher))
+    return started
+
+
+def scripted(patch: pytest.MonkeyPatch, *topics: str, nodes: tuple[str, ...] = ()) -> Script:
+    subject = Node(
+        Endpoint("m", 1), None, "/me", Selection(topics, nodes), Backlog(), {}, SystemClock(),
+        max_message=1 << 20, timeout=1.0,
+    )  # fmt: skip
+    subject._uri = API
+    subject.deadlines.close()
+    script = Script(subject)
+    patch.setattr(api, "call", script)
+    return script
+
+
+@pytest.fixture
+def make(monkeypatch, begun) -> Callable[..., Script]:
+    return lambda *topics, **options: scripted(monkeypatch, *topics, **options)
+
+
+def connected(script: Script, topic: str) -> list[str]:
+    state = script.subject._topics.get(topic)
+    return list(state.publishers) if state is not None else []
+
+
+def read_from(publisher: Publisher) -> None:
+    """As if its header had been accepted."""
+    publisher.publication = Publication("a/msg/B", "0" * 32, None, False, "/n")  # type: ignore[arg-type]
+
+
+def test_a_named_topic_is_registered_before_anybody_publishes_it(make):
+    script = make("/a", "/b*")
+    assert script.turn() == ["registerSubscriber /a"]
+    assert script.turn() == []
+
+
+def test_a_pattern_is_registered_when_it_matches_and_left_when_it_does_not(make, begun):
+    script = make("/b*")
+    script.publishers = {"/b1": ["http://x:1/"], "/c": ["http://x:1/"]}
+    assert script.turn() == ["registerSubscriber /b1"]
+    assert connected(script, "/b1") == ["http://x:1/"]
+    script.publishers = {}
+    assert script.turn() == ["unregisterSubscriber /b1"]
+    assert begun[0].over.is_set()
+    assert script.subject._topics == {}
+
+
+def test_the_doorbell_has_the_master_asked_and_nothing_believed(make, begun):
+    script = make("/a")
+    script.publishers = {"/a": ["http://x:1/"]}
+    script.turn()
+    assert script.subject._answer("publisherUpdate", ["/master", "/a", ["http://liar:1/"]]) == [1, "", 0]
+    assert script.subject._answer("publisherUpdate", ["/master", "/unknown", ["http://liar:1/"]]) == [1, "", 0]
+    script.publishers = {"/a": ["http://y:1/"]}
+    assert script.turn() == ["registerSubscriber /a"]
+    assert connected(script, "/a") == ["http://y:1/"]
+    assert (begun[0].over.is_set(), begun[1].over.is_set()) == (True, False)
+    assert script.turn() == []
+
+
+def test_publishers_come_to_light_even_if_the_doorbell_never_rings(make):
+    script = make("/a")
+    script.turn()
+    script.publishers = {"/a": ["http://x:1/"]}
+    assert script.turn() == ["registerSubscriber /a"]
+    assert connected(script, "/a") == ["http://x:1/"]
+    # One that starts anew under its name, at another address: when its connection has ended, the master is asked.
+    [publisher] = script.subject._publishers
+    script.subject.ended(publisher, EOFError())
+    assert script.turn() == ["registerSubscriber /a"]
+
+
+@pytest.mark.parametrize("pattern", ["/a", "/*"])
+def test_a_restarted_master_is_told_again_and_living_connections_are_kept(make, begun, pattern):
+    script = make(pattern)
+    script.publishers = {"/a": ["http://living:1/", "http://dead:1/"]}
+    script.turn()
+    living, dead = begun
+    read_from(living)
+    script.publishers, script.subscribers, script.apis = {}, {}, {}  # publishers do not register again
+    assert script.turn() == (["registerSubscriber /a"] if pattern == "/a" else [])
+    assert (living.over.is_set(), dead.over.is_set()) == (False, True)
+    script.turn()
+    assert not living.over.is_set()
+    # Once it ends, there is nobody to ask for it again.
+    assert living.kept
+    script.subject.gone(living)
+    script.turn()
+    assert connected(script, "/a") == []
+
+
+def test_a_publisher_that_registers_again_at_the_new_master_is_an_ordinary_one_again(make, begun):
+    script = make("/a")
+    script.publishers = {"/a": ["http://x:1/"]}
+    script.turn()
+    read_from(begun[0])
+    script.publishers, script.subscribers, script.apis = {}, {}, {}
+    script.turn()
+    assert begun[0].kept
+    script.publishers = {"/a": ["http://x:1/"]}
+    script.turn()
+    assert not begun[0].kept
+    assert len(begun) == 1
+
+
+def test_a_name_that_was_taken_is_left_to_the_other(make):
+    script = make("/a")
+    script.turn()
+    script.apis["/me"], script.subscribers = "http://other:1/", {"/a": {"/me"}}
+    assert script.turn() == ["registerSubscriber /a"]
+    assert script.subject.caller_id == "/me_2"
+    assert script.subscribers == {"/a": {"/me", "/me_2"}}
+    assert script.turn() == []
+
+
+def test_a_dead_namesake_from_before_is_replaced(make):
+    script = make("/a")
+    script.apis["/me"] = "http://dead:1/"
+    assert script.turn() == ["registerSubscriber /a"]
+    assert (script.subject.caller_id, script.apis["/me"]) == ("/me", API)
+
+
+def test_a_farewell_that_did_not_reach_the_master_is_said_again(make):
+    script = make("/a")
+    script.subscribers = {"/old": {"/me"}, "/foreign": {"/other"}}
+    assert script.turn() == ["unregisterSubscriber /old", "registerSubscriber /a"]
+    assert script.subscribers["/foreign"] == {"/other"}
+
+
+@pytest.mark.parametrize("failure", [ProtocolError("nonsense"), ConnectionRefusedError(), TimeoutError(), EOFError()])
+def test_a_master_that_fails_is_said_once_and_asked_again(make, begun, caplog, failure):
+    script = make("/a")
+    script.publishers = {"/a": ["http://x:1/"]}
+    script.turn()
+    script.failure = failure
+    for _ in range(3):
+        script.turn()
+    assert len([record for record in caplog.records if "the master does not answer" in record.getMessage()]) == 1
+    assert not begun[0].over.is_set()
+    script.failure = None
+    assert script.turn() == []
+
+
+def test_a_refused_topic_does_not_keep_the_others_waiting(make, caplog):
+    script = make("/a", "/b")
+
+    def refuse(caller, topic, *more):
+        if topic == "/a":
+            raise api.Refusal("not you")
+        return Script.registerSubscriber(script, caller, topic, *more)
+
+    script.registerSubscriber = refuse
+    assert script.turn() == ["registerSubscriber /a", "registerSubscriber /b"]
+    assert script.turn() == []  # it is asked again after a while
+    assert "does not take a subscription to /a: not you" in caplog.text
+
+
+def test_connections_and_topics_are_limited(make, begun, monkeypatch, caplog):
+    monkeypatch.setattr(node, "MAX_CONNECTIONS", 50)
+    monkeypatch.setattr(node, "MAX_TOPICS", 20)
+    script = make("/*")
+    script.publishers = {f"/t{n:04}": [f"http://x{n}:{m}/" for m in range(1, 6)] for n in range(1000)}
+    script.turn()
+    assert len(begun) == 50
+    assert len(script.subject._topics) == 20
+    assert len(caplog.records) == 2
+
+
+ENDS = {"closed": EOFError(), "reset": ConnectionResetError(), "silent": TimeoutError(), "nonsense": ProtocolError("x")}
+
+
+@pytest.mark.parametrize("error", ENDS.values(), ids=ENDS)
+def test_attempts_come_at_longer_and_longer_intervals_until_a_connection_lasts(make, begun, monkeypatch, error):
+    script = make("/a")
+    script.publishers = {"/a": ["http://x:1/"]}
+    script.turn()
+    [publisher] = begun
+    now, lasting, waits = 0.0, [0.0] * 12 + [STEADY] + [0.0] * 3, []
+
+    def connect() -> None:
+        nonlocal now
+        now += lasting.pop(0)
+        if not lasting:
+            publisher.over.set()
+        raise error
+
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    monkeypatch.setattr(publisher, "_connect", connect)
+    monkeypatch.setattr(publisher.over, "wait", waits.append)
+    publisher.run()
+    assert waits[:7] == [FIRST_RETRY * 2**n for n in range(7)]
+    assert waits[7:12] == [LAST_RETRY] * 5
+    assert waits[12:15] == [FIRST_RETRY, FIRST_RETRY * 2, FIRST_RETRY * 4]
+    assert script.subject._publishers == set()
+
+
+VALUES = st.recursive(
+    st.one_of(st.integers(-2, 2), st.sampled_from(["/a", "/b/1", "/me", "/n1", "http://p:1/", API]), st.none()),
+    lambda inner: st.lists(inner, max_size=3),
+    max_leaves=8,
+)
+URIS = st.lists(st.sampled_from([f"http://p:{n}/" for n in range(1, 4)]))
+TOPICS = st.sampled_from(["/a", "/b/1", "/b/2", "/c"])
+PAIRS = st.lists(st.tuples(TOPICS, st.lists(st.sampled_from(["/me", "/n1", "/n2"]))).map(list))
+TURNS = st.lists(
+    st.fixed_dictionaries({
+        "lookupNode": st.one_of(st.sampled_from([API, "http://other/"]), VALUES),
+        "getSystemState": st.one_of(st.tuples(PAIRS, PAIRS, st.just([])).map(list), VALUES),
+        "registerSubscriber": st.one_of(URIS, VALUES),
+        "unregisterSubscriber": VALUES,
+        "failing": st.sampled_from(["", "", "", "lookupNode", "getSystemState", "registerSubscriber"]),
+        "ends": st.booleans(),
+    }),
+    max_size=6,
+)  # fmt: skip
+
+
+@given(TURNS)
+@settings(max_examples=150)
+def test_after_a_master_that_answers_anything_one_that_answers_again_has_us_registered(turns):
+    with pytest.MonkeyPatch.context() as patch:
+        begun: list[Publisher] = []
+        patch.setattr(Publisher, "start", lambda publisher: begun.append(publisher))
+        script = scripted(patch, "/a", "/b/*", nodes=("/n1",))
+        for turn in turns:
+
+            def answer(_endpoint, _deadlines, _timeout, _limit, method, *_more, turn=turn):
+                if method == turn["failing"]:
+                    raise TimeoutError
+                return turn[method]
+
+            patch.setattr(api, "call", answer)
+            script.subject._look()
+            for publisher in begun if turn["ends"] else ():
+                script.subject.ended(publisher, EOFError())
+                if publisher.over.is_set():
+                    script.subject.gone(publisher)
+            uris = [(p.topic, p.uri) for p in script.subject._publishers if not p.over.is_set()]
+            assert len(uris) == len(set(uris)), "one connection for each publisher"
+        patch.setattr(api, "call", script)
+        script.publishers = {"/a": ["http://p:1/"]}
+        for _ in range(4):
+            script.turn()
+        assert script.subscribers["/a"] == {script.subject.caller_id}
+        assert connected(script, "/a") == ["http://p:1/"]
+        assert [topic for topic in script.subject._topics if not connected(script, topic)] == []
+        assert script.turn() == []
