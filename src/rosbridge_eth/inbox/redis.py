@@ -85,7 +85,7 @@ class RedisInbox(Inbox):
         try:
             self._open()
         except BaseException as error:
-            if "permission" in str(error):
+            if isinstance(error.__context__, redis.ResponseError):
                 self._require_rights()
             self.close()
             raise
