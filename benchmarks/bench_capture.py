@@ -1,4 +1,4 @@
-"""Capture: from the raw bytes of a message, out of the sample bag, to a record's JSON.
+"""Capture: from the raw bytes of a message, out of the sample bag, to a line of the log, and a line read back.
 
 The peer is the obvious way with the same library: rosbags' deserialisation,
 `dataclasses.asdict` and `json.dumps`, without checks, rules or selection.
@@ -12,9 +12,20 @@ import threading
 from typing import Any
 
 import numpy
+import orjson
 import pytest
 
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule, Wire, decoder_for_known
+from rosbridge_eth.capture import (
+    Capture,
+    Conversion,
+    RawMessage,
+    Restoration,
+    TopicRule,
+    Wire,
+    decoder_for_known,
+    definition_line,
+    parse_line,
+)
 from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
 
 
@@ -51,8 +62,8 @@ def run(benchmark: Any, implementation: str, function: Any, inputs: list[RawMess
 
 
 def captured(rule: TopicRule) -> Any:
-    capture = Capture([rule], lambda notice: None)
-    return lambda message: capture.process(message, 1, 2).to_json()  # type: ignore[union-attr]
+    capture = Capture([rule], source_kind="bag", notify=lambda notice: None)
+    return lambda message: capture.process(message, 1).line  # type: ignore[union-attr]
 
 
 def the_obvious_way(message: RawMessage) -> str:
@@ -60,14 +71,18 @@ def the_obvious_way(message: RawMessage) -> str:
     return json.dumps(dataclasses.asdict(decoded), default=lambda array: array.tolist())  # type: ignore[call-overload]
 
 
+POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pose", "twist.twist")
+
+
 @pytest.mark.benchmark(group="capture Odometry")
-def test_odometry_default_fields(benchmark: Any) -> None:
-    run(benchmark, "rosbridge_eth, default fields", captured(TopicRule("**")), messages("/robot_1/odom"))
+def test_odometry_pose_and_twist(benchmark: Any) -> None:
+    rule = TopicRule("**", fields=POSE_AND_TWIST)
+    run(benchmark, "rosbridge_eth, pose and twist", captured(rule), messages("/robot_1/odom"))
 
 
 @pytest.mark.benchmark(group="capture Odometry")
 def test_odometry_every_field(benchmark: Any) -> None:
-    run(benchmark, "rosbridge_eth, every field", captured(TopicRule("**", fields=("*",))), messages("/robot_1/odom"))
+    run(benchmark, "rosbridge_eth, every field", captured(TopicRule("**")), messages("/robot_1/odom"))
 
 
 @pytest.mark.benchmark(group="capture Odometry")
@@ -78,6 +93,45 @@ def test_odometry_the_obvious_way(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="capture Odometry")
 def test_odometry_decoding_alone(benchmark: Any) -> None:
     run(benchmark, "rosbags, decoding alone", lambda m: m.decoder.decode(m.raw), messages("/robot_1/odom"))
+
+
+@pytest.mark.benchmark(group="capture Odometry")
+def test_odometry_choosing_and_writing_alone(benchmark: Any) -> None:
+    inputs = messages("/robot_1/odom")
+    capture = captured(TopicRule("**"))
+    decoded = {message.raw: message.decoder.decode(message.raw) for message in inputs}
+    lines = {message.raw: parse_line(capture(message)) for message in inputs}
+    conversion = Conversion(inputs[0].decoder)
+
+    def write(message: RawMessage) -> bytes:
+        data = conversion.convert(decoded[message.raw])
+        return orjson.dumps({"topic": message.topic, "data": data})
+
+    assert all(lines[message.raw].data == orjson.loads(write(message))["data"] for message in inputs)
+    run(benchmark, "rosbridge_eth, without decoding", write, inputs)
+
+
+@pytest.mark.benchmark(group="read Odometry")
+def test_odometry_parsed(benchmark: Any) -> None:
+    capture = captured(TopicRule("**"))
+    lines = {message.raw: capture(message) for message in messages("/robot_1/odom")}
+    run(benchmark, "rosbridge_eth, checked", lambda m: parse_line(lines[m.raw]), messages("/robot_1/odom"))
+
+
+@pytest.mark.benchmark(group="read Odometry")
+def test_odometry_parsed_by_json(benchmark: Any) -> None:
+    capture = captured(TopicRule("**"))
+    lines = {message.raw: capture(message) for message in messages("/robot_1/odom")}
+    run(benchmark, "json, unchecked", lambda m: json.loads(lines[m.raw]), messages("/robot_1/odom"))
+
+
+@pytest.mark.benchmark(group="read Odometry")
+def test_odometry_restored(benchmark: Any) -> None:
+    capture, inputs = captured(TopicRule("**")), messages("/robot_1/odom")
+    data = {message.raw: parse_line(capture(message)).data for message in inputs}
+    restoration = Restoration(parse_line(definition_line(inputs[0].decoder)).decoder())
+    run(benchmark, "rosbridge_eth, to ROS bytes", lambda m: restoration.decoder.encode(
+        restoration.restore(data[m.raw]).message), inputs)  # fmt: skip
 
 
 @pytest.mark.benchmark(group="capture Imu")
@@ -92,7 +146,7 @@ def test_imu_the_obvious_way(benchmark: Any) -> None:
 
 @pytest.mark.benchmark(group="capture LaserScan of 720 readings")
 def test_scan_as_digests(benchmark: Any) -> None:
-    run(benchmark, "rosbridge_eth, digests", captured(TopicRule("**")), scan(720))
+    run(benchmark, "rosbridge_eth, digests", captured(TopicRule("**", limit=1024)), scan(720))
 
 
 @pytest.mark.benchmark(group="capture LaserScan of 720 readings")
@@ -102,7 +156,7 @@ def test_scan_one_reading(benchmark: Any) -> None:
 
 @pytest.mark.benchmark(group="capture LaserScan of 720 readings")
 def test_scan_in_full(benchmark: Any) -> None:
-    run(benchmark, "rosbridge_eth, in full", captured(TopicRule("**", limit=1 << 14)), scan(720))
+    run(benchmark, "rosbridge_eth, in full", captured(TopicRule("**")), scan(720))
 
 
 @pytest.mark.benchmark(group="capture LaserScan of 720 readings")
@@ -112,13 +166,13 @@ def test_scan_the_obvious_way(benchmark: Any) -> None:
 
 @pytest.mark.benchmark(group="replay of the sample bag, 600 messages")
 def test_replay_and_capture(benchmark: Any) -> None:
-    """Open the bag, check its definitions, read, decode, capture, encode."""
+    """Open the bag, check its definitions, read, decode, capture."""
 
     def replay() -> int:
         source = BagSource(BagSettings(sample_bag(), speed=None), Selection(["**"]))
-        capture = Capture([TopicRule("**")])
+        capture = Capture([TopicRule("**")], source_kind=source.kind)
         records: list[bytes] = []
-        source.run(lambda message: records.append(capture.process(message, 1, 2).to_json()), threading.Event())  # type: ignore[union-attr]
+        source.run(lambda message: records.append(capture.process(message, 1).line), threading.Event())  # type: ignore[union-attr]
         source.close()
         return len(records)
 

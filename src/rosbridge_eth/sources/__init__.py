@@ -16,21 +16,9 @@ from rosbridge_eth.sources.selection import Selection
 from rosbridge_eth.sources.sim import SimSettings, SimSource
 
 __all__ = [
-    "KINDS",
-    "BagSettings",
-    "BagSource",
-    "Clock",
-    "Emit",
-    "Offer",
-    "Selection",
-    "SimSettings",
-    "SimSource",
-    "Source",
-    "SourceSettings",
-    "SystemClock",
-    "open_source",
-    "sample_bag",
-]
+    "KINDS", "BagSettings", "BagSource", "Clock", "Emit", "Offer", "Selection", "SimSettings", "SimSource", "Source",
+    "SourceSettings", "SystemClock", "open_source", "sample_bag",
+]  # fmt: skip
 
 
 class SourceSettings(Protocol):

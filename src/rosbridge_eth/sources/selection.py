@@ -35,11 +35,6 @@ class Selection:
         """The topics that are asked for by name, with their leading slash: known before anybody offers them."""
         return tuple(dict.fromkeys(pattern.text for pattern in self._topics if pattern.is_exact))
 
-    @property
-    def names_only_topics(self) -> bool:
-        """Whether `named_topics` is all that is asked for."""
-        return not self._nodes and all(pattern.is_exact for pattern in self._topics)
-
     def names(self, topic: str) -> bool:
         """Whether the topic is asked for by its name, not by a pattern or a node."""
         return any(pattern.is_exact and pattern.matches(topic) for pattern in self._topics)

@@ -393,7 +393,7 @@ def test_idl_as_rosidl_generates_it():
         "module pkg { module msg { struct T { " + "a::" * 5000 + "b x; }; }; };",
         "module pkg { module msg { " + "".join(f"typedef T{n + 1} T{n};" for n in range(2000)) + "struct T { T0 x; };",
         "module pkg { module msg { struct T { " + "sequence<long, 4> x; " * 3000 + "}; }; };",
-        "module pkg { module msg { struct T { " + "".join(f"sequence<string<5>, 4> x{n};" for n in range(900)) + "}; }; };",
+        "module pkg { module msg { struct T { " + "".join(f"sequence<string<5>, 4> x{n};" for n in range(900)) + "}; };",
         "module pkg { module msg { " + "const long A = 1;" * 2000 + "struct T { " + "long x[A];" * 1000 + "}; }; };",
         "struct T { long x; }; " * 3000,
         "const",
