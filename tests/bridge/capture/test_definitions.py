@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from rosbridge_eth.capture import DefinitionError, Wire, decoder_for, decoder_for_known, read_definition
+from rosbridge_eth.capture import (
+    Conversion,
+    DefinitionError,
+    Restoration,
+    Wire,
+    decoder_for,
+    decoder_for_known,
+    read_definition,
+)
 from rosbridge_eth.capture.definitions import MAX_DEPTH, MAX_FIELDS, MAX_KEPT, MAX_TEXT, check_types, write_text
 
 SEPARATOR = "=" * 80
@@ -183,6 +191,19 @@ def test_deep_nesting_is_refused_and_reasonable_nesting_is_not():
     read_definition("a/T0", nested(MAX_DEPTH))
     with pytest.raises(DefinitionError, match="deep"):
         read_definition("a/T0", nested(MAX_DEPTH + 1))
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("array", ["", "[]", "[1]"])
+def test_what_is_read_can_be_captured_whatever_its_depth_and_width(array):
+    deep = [("" if n == 0 else f"a/T{n}\n") + f"T{n + 1}{array} x" for n in range(MAX_DEPTH)]
+    wide = [("" if n == 0 else f"a/T{n}\n") + "\n".join(f"T{n + 1}{array} x{m}" for m in range(7)) for n in range(4)]
+    for levels in (deep, wide):
+        decoder = decoder_for(Wire.ROS1, "a/T0", definition(*levels, f"a/T{len(levels)}\nuint8 x\nstring s"))
+        raw = Restoration(decoder)
+        message = decoder.decode(decoder.encode(raw.restore({}).message))
+        data = Conversion(decoder).convert(message)
+        assert decoder.encode(raw.restore(data).message) == decoder.encode(message)
 
 
 def test_arrays_of_nothing_are_refused():
@@ -393,7 +414,7 @@ def test_idl_as_rosidl_generates_it():
         "module pkg { module msg { struct T { " + "a::" * 5000 + "b x; }; }; };",
         "module pkg { module msg { " + "".join(f"typedef T{n + 1} T{n};" for n in range(2000)) + "struct T { T0 x; };",
         "module pkg { module msg { struct T { " + "sequence<long, 4> x; " * 3000 + "}; }; };",
-        "module pkg { module msg { struct T { " + "".join(f"sequence<string<5>, 4> x{n};" for n in range(900)) + "}; };",
+        "module pkg { module msg { struct T { " + " ".join(f"string<5> x{n};" for n in range(900)) + "}; }; };",
         "module pkg { module msg { " + "const long A = 1;" * 2000 + "struct T { " + "long x[A];" * 1000 + "}; }; };",
         "struct T { long x; }; " * 3000,
         "const",
