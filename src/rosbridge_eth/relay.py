@@ -57,7 +57,10 @@ class Relay:
     def _run(self) -> None:
         while not self._stop.is_set():
             for sock in select.select([self._near, self._far], [], [], 0.05)[0]:
-                data, sender = sock.recvfrom(LONGEST)
+                try:
+                    data, sender = sock.recvfrom(LONGEST)
+                except OSError:
+                    continue  # news that a datagram found nobody; UDP promises no more
                 self._on_datagram(data)
                 if sock is self._near:
                     self._client = sender
@@ -72,10 +75,15 @@ class Relay:
         if out not in self._held and self._random.random() < self._harm.reorder:
             self._held[out] = data, to  # goes after the next one
             return
-        out.sendto(data, to)
-        self.passed += 1
+        self._send(out, data, to)
         if self._random.random() < self._harm.duplicate:
-            out.sendto(data, to)
+            self._send(out, data, to)
         if out in self._held:
-            out.sendto(*self._held.pop(out))
+            self._send(out, *self._held.pop(out))
+
+    def _send(self, out: socket.socket, data: bytes, to: tuple[str, int]) -> None:
+        try:
+            out.sendto(data, to)
             self.passed += 1
+        except OSError:
+            self.lost += 1

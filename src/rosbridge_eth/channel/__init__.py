@@ -14,7 +14,6 @@ from rosbridge_eth.channel.events import (
     Disconnected,
     Drop,
     End,
-    Endpoint,
     Event,
     Full,
     HandshakeFailed,
@@ -29,6 +28,6 @@ from rosbridge_eth.channel.wire import Mode, Reason
 
 __all__ = [
     "Address", "AddressChanged", "ChannelConfig", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End",
-    "Endpoint", "Event", "Full", "HandshakeFailed", "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server",
+    "Event", "Full", "HandshakeFailed", "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server",
     "ServerConfig", "Statistics", "cookie_key",
 ]  # fmt: skip

@@ -21,7 +21,7 @@ from rosbridge_eth.channel.events import (
     NotConnected,
     Statistics,
 )
-from rosbridge_eth.channel.handshake import ClientHandshake, HandshakeRefused, Randomness, VerifiedCertificates
+from rosbridge_eth.channel.handshake import ClientHandshake, HandshakeRefused, Randomness
 from rosbridge_eth.channel.session import NEVER, Budget, Session
 from rosbridge_eth.channel.states import CLIENT, ClientInput, ClientState, advance
 from rosbridge_eth.channel.wire import Assembly, Kind, Malformed, Reason
@@ -33,7 +33,7 @@ LAST_RETRY = 2.0
 RETRY_GROWTH = 1.5
 MAX_BAD_OFFERS = 8
 """Offers that do not hold, after which an attempt is given up: nobody makes a client verify all day."""
-CLOSE_TRIES = 3
+CLOSES = 2
 ACCEPTED_SIZE = 8
 PATIENCE_PTOS = 8
 _HINTS = {
@@ -64,8 +64,7 @@ class Client:
     ) -> None:  # fmt: skip
         self.config = config
         self.state = ClientState.IDLE
-        self._identity, self._server_name = identity, server_name
-        self._certificates = VerifiedCertificates(trust, capacity=4, recheck=600.0)
+        self._identity, self._trust, self._server_name = identity, trust, server_name
         self._wall, self._randomness = wall, randomness or Randomness()
         self._now = now
         self._address: Address = ("", 0)
@@ -87,7 +86,6 @@ class Client:
         self._assembly = Assembly()
         self._session: Session | None = None
         self._peer: PeerIdentity | None = None
-        self._closes_left = 0
 
     # What the program calls
 
@@ -137,16 +135,14 @@ class Client:
         return event
 
     def close(self, now: float) -> None:
-        """End the session, or the attempt at one. Disconnected follows when the server knows, or soon after."""
-        if self.state in (ClientState.IDLE, ClientState.CLOSING):
+        """End the session, or the attempt at one. The server is told twice, and else learns it by silence."""
+        if self.state is ClientState.IDLE:
             return
-        self._outbox.clear()
-        if self.state is ClientState.FINISHING:
-            self._peer = None  # it was never connected, so it is not disconnected
+        if self.state is ClientState.CONNECTED and self._session is not None:
+            self._outbox += [self._session.close_datagram(End.CLOSED) for _ in range(CLOSES)]
+            self._disconnected(End.CLOSED)
         self._advance(ClientInput.CLOSE)
-        if self._session is not None:  # the table leads to CLOSING from where there is one
-            self._closes_left = CLOSE_TRIES
-            self._send_close(now)
+        self._session = self._handshake = None
 
     def statistics(self) -> Statistics:
         return self._counters.snapshot(connections=int(self.state is ClientState.CONNECTED))
@@ -216,11 +212,6 @@ class Client:
             case ClientState.WAITING if now >= self._retry_at:
                 self._advance(ClientInput.RETRY)
                 self._greet(now)
-            case ClientState.CLOSING if now >= self._retry_at:
-                if self._closes_left:
-                    self._send_close(now)
-                else:
-                    self._closed()
             case ClientState.FINISHING | ClientState.CONNECTED if session is not None:
                 session.handle_timer(now)
                 if self.state is ClientState.FINISHING and now >= self._deadline:
@@ -304,9 +295,7 @@ class Client:
         if body is None:
             return
         try:
-            agreed = handshake.accept(
-                body, self._certificates, server_name=self._server_name, at=self._wall(), now=now
-            )
+            agreed = handshake.accept(body, self._trust, server_name=self._server_name, at=self._wall())
         except HandshakeRefused as refused:
             self._counters.drop(refused.drop)
             self._why = HandshakeFailed(f"the server's offer is refused: {refused}")
@@ -391,9 +380,6 @@ class Client:
         if session is None or session.ended is None:
             return
         reason = session.ended
-        if self.state is ClientState.CLOSING:
-            self._closed()
-            return
         if reason in (End.PROTOCOL, End.EXPIRED):
             self._outbox.append(session.close_datagram(reason))
         if self.state is ClientState.FINISHING:
@@ -413,14 +399,3 @@ class Client:
     def _disconnected(self, reason: End) -> None:
         if self._peer is not None:
             self._events.append(Disconnected(reason, self._cid, self._peer))
-
-    def _send_close(self, now: float) -> None:
-        if self._session is not None:
-            self._outbox.append(self._session.close_datagram(End.CLOSED))
-            self._closes_left -= 1
-            self._retry_at = now + self._session.pto
-
-    def _closed(self) -> None:
-        self._advance(ClientInput.CLOSED)
-        self._disconnected(End.CLOSED)
-        self._session = None

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Protocol
 
 from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.wire import Mode, Reason
@@ -111,20 +110,6 @@ class HandshakeFailed:
 Event = Connected | Disconnected | Message | AddressChanged | HandshakeFailed
 
 
-class Endpoint(Protocol):
-    """What Client and Server have in common."""
-
-    def receive_datagram(self, data: bytes, address: Address, now: float) -> None: ...
-
-    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]: ...
-
-    def next_timer(self) -> float | None: ...
-
-    def handle_timer(self, now: float) -> None: ...
-
-    def next_event(self) -> Event | None: ...
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChannelConfig:
     """Settings of either end. Times in seconds, sizes in bytes."""
@@ -193,9 +178,6 @@ class ServerConfig(ChannelConfig):
     max_sources: int = 4096
     handshake_share: float = 0.5
     """Share of time that handshakes may take."""
-    max_certificates: int = 4096
-    certificate_recheck: float = 600.0
-    """A verified pair of certificates is believed for so long before its chain is verified again."""
 
     def __post_init__(self) -> None:
         super(ServerConfig, self).__post_init__()

@@ -27,8 +27,7 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 
@@ -62,41 +61,6 @@ class Randomness:
 
     bytes: Callable[[int], bytes] = secrets.token_bytes
     private_key: Callable[[], sm2.PrivateKey] = field(default=sm2.PrivateKey.generate)
-
-
-class VerifiedCertificates:
-    """Pairs of certificates whose chains were verified, so that a peer who comes again costs less.
-
-    Only what was found good is kept, at most `capacity` pairs, for `recheck`
-    seconds. Validity, role, name and allow list are looked at every time.
-    """
-
-    __slots__ = ("_known", "_trust", "capacity", "recheck")
-
-    def __init__(self, trust: Trust, *, capacity: int, recheck: float) -> None:
-        self._trust = trust
-        self.capacity = capacity
-        self.recheck = recheck
-        self._known: OrderedDict[tuple[bytes, bytes], tuple[float, PeerIdentity]] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._known)
-
-    def check(
-        self, signing: bytes, encryption: bytes, *,
-        role: Role | Iterable[Role], name: str | None, at: datetime, now: float,
-    ) -> PeerIdentity:  # fmt: skip
-        """As Trust.check; `now` is the monotonic clock."""
-        pair = (signing, encryption)
-        entry = self._known.get(pair)
-        if entry is None or now - entry[0] > self.recheck:
-            entry = (now, self._trust.examine(signing, encryption, at=at))
-            self._known[pair] = entry
-            if len(self._known) > self.capacity:
-                self._known.popitem(last=False)
-        self._known.move_to_end(pair)
-        self._trust.permit(entry[1], role=role, name=name, at=at)
-        return entry[1]
 
 
 def exchange_id(role: Role, encryption_certificate: bytes) -> bytes:
@@ -157,9 +121,7 @@ class ClientHandshake:
         self._transcript = transcript
         return unsigned + signature
 
-    def accept(
-        self, body: bytes, certificates: VerifiedCertificates, *, server_name: str | None, at: datetime, now: float
-    ) -> Agreed:
+    def accept(self, body: bytes, trust: Trust, *, server_name: str | None, at: datetime) -> Agreed:
         """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
         if self._transcript is None:
             raise HandshakeRefused(Drop.UNEXPECTED, "an offer before the proof")
@@ -177,7 +139,7 @@ class ClientHandshake:
         ):
             raise HandshakeRefused(Drop.MALFORMED, "a field of the offer has another length")
         try:
-            peer = certificates.check(signing, encryption, role=Role.SERVER, name=server_name, at=at, now=now)
+            peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
             raise HandshakeRefused(Drop.CERTIFICATE, str(error)) from error
         transcript = self._transcript.copy()
@@ -208,19 +170,9 @@ class ServerHandshake:
     __slots__ = ("_exchange", "_finished", "offer", "peer", "secrets")
 
     def __init__(
-        self,
-        hello: Hello,
-        cookie: bytes,
-        body: bytes,
-        *,
-        identity: Identity,
-        certificates: VerifiedCertificates,
-        roles: tuple[Role, ...],
-        server_cid: bytes,
-        randomness: Randomness,
-        at: datetime,
-        now: float,
-    ) -> None:
+        self, hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, roles: tuple[Role, ...],
+        server_cid: bytes, randomness: Randomness, at: datetime,
+    ) -> None:  # fmt: skip
         """Raise HandshakeRefused unless certificates and signature hold. The cookie was checked before."""
         exchange = hello.mode is Mode.EXCHANGE
         try:
@@ -230,7 +182,7 @@ class ServerHandshake:
         if len(point) != (POINT_SIZE if exchange else 0):
             raise HandshakeRefused(Drop.MALFORMED, "a field of the proof has another length")
         try:
-            self.peer = certificates.check(signing, encryption, role=roles, name=None, at=at, now=now)
+            self.peer = trust.check(signing, encryption, role=roles, at=at)
         except ids.UntrustedCertificate as error:
             hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
             hint = hints.get(type(error), Reason.CERTIFICATE)

@@ -30,7 +30,7 @@ from rosbridge_eth.channel.events import (
     ServerConfig,
     Statistics,
 )
-from rosbridge_eth.channel.handshake import HandshakeRefused, Randomness, ServerHandshake, VerifiedCertificates
+from rosbridge_eth.channel.handshake import HandshakeRefused, Randomness, ServerHandshake
 from rosbridge_eth.channel.session import LENGTH_SIZE, NEVER, Budget, Session
 from rosbridge_eth.channel.states import SERVER, ServerInput, ServerState, advance
 from rosbridge_eth.channel.wire import Assembly, Hello, Kind, Malformed, Reason
@@ -109,10 +109,7 @@ class Server:
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:  # fmt: skip
         self.config = config
-        self._identity = identity
-        self._certificates = VerifiedCertificates(
-            trust, capacity=config.max_certificates, recheck=config.certificate_recheck
-        )
+        self._identity, self._trust = identity, trust
         self._wall, self._randomness, self._stopwatch = wall, randomness or Randomness(), stopwatch
         self._cookies = Cookies(cookie_key, config.cookie_lifetime)
         self._sources = Sources(config.source_rate, config.source_burst, config.max_sources)
@@ -362,8 +359,8 @@ class Server:
             raise HandshakeRefused(Drop.CONNECTIONS, "no room for another connection", Reason.FULL)
         cid = self._new_cid()
         handshake = ServerHandshake(
-            half_open.hello, half_open.cookie, body, identity=self._identity, certificates=self._certificates,
-            roles=self.config.roles, server_cid=cid, randomness=self._randomness, at=self._wall(), now=now,
+            half_open.hello, half_open.cookie, body, identity=self._identity, trust=self._trust,
+            roles=self.config.roles, server_cid=cid, randomness=self._randomness, at=self._wall(),
         )  # fmt: skip
 
         def admit(frames: bytes) -> bool:
@@ -460,7 +457,7 @@ class Server:
 
     def _remove(self, connection: _Connection, reason: End) -> None:
         was_connected = connection.state is ServerState.CONNECTED
-        if was_connected and connection.quota >= wire.DATA_OVERHEAD + 2:
+        if was_connected and reason is not End.CLOSED_BY_PEER and connection.quota >= wire.DATA_OVERHEAD + 2:
             self._outbox.append((connection.session.close_datagram(reason), connection.address))
         connection.state = advance(SERVER, connection.state, ServerInput.CLOSED)
         self._half_open.pop(connection.half_open_key, None)

@@ -21,7 +21,6 @@ class ClientState(StrEnum):
     FINISHING = "finishing"  # FINISHED sent, waiting for ACCEPTED
     CONNECTED = "connected"
     WAITING = "waiting"  # between two attempts
-    CLOSING = "closing"  # CLOSE sent, waiting for its answer
 
 
 class ClientInput(StrEnum):
@@ -35,7 +34,6 @@ class ClientInput(StrEnum):
     RETRY = "wait is over"
     LOST = "session ended"
     CLOSE = "close()"
-    CLOSED = "closed"
 
 
 class ServerState(StrEnum):
@@ -67,12 +65,11 @@ CLIENT: Mapping[tuple[ClientState, ClientInput], ClientState] = {
     (ClientState.PROVING, ClientInput.CLOSE): ClientState.IDLE,
     (ClientState.FINISHING, ClientInput.ACCEPTED): ClientState.CONNECTED,
     (ClientState.FINISHING, ClientInput.FAILED): ClientState.WAITING,
-    (ClientState.FINISHING, ClientInput.CLOSE): ClientState.CLOSING,
+    (ClientState.FINISHING, ClientInput.CLOSE): ClientState.IDLE,
     (ClientState.CONNECTED, ClientInput.LOST): ClientState.WAITING,
-    (ClientState.CONNECTED, ClientInput.CLOSE): ClientState.CLOSING,
+    (ClientState.CONNECTED, ClientInput.CLOSE): ClientState.IDLE,
     (ClientState.WAITING, ClientInput.RETRY): ClientState.GREETING,
     (ClientState.WAITING, ClientInput.CLOSE): ClientState.IDLE,
-    (ClientState.CLOSING, ClientInput.CLOSED): ClientState.IDLE,
 }
 
 SERVER: Mapping[tuple[ServerState, ServerInput], ServerState] = {

@@ -1,10 +1,9 @@
 """Sockets under the channel: a loop that receives, hands out events, and sends. The only part that waits.
 
-Several processes of a server share one port by SO_REUSEPORT. Where the kernel
-takes a filter for it (Linux, SO_ATTACH_REUSEPORT_CBPF), a datagram goes to
-the process whose number stands in its connection id, so a robot whose address
-changes stays with its process; elsewhere the kernel chooses by address, and
-such a robot makes a new session after `patience`.
+Several processes of a server share one port by SO_REUSEPORT. Where the kernel takes a filter for it (Linux,
+SO_ATTACH_REUSEPORT_CBPF), a datagram goes to the process whose number stands in its connection id, so a robot whose
+address changes stays with its process; elsewhere the kernel chooses by address, and such a robot makes a new session
+after `patience`.
 """
 
 from __future__ import annotations
@@ -15,20 +14,19 @@ import select
 import socket
 import struct
 import sys
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
 
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import Endpoint, Event
+from rosbridge_eth.channel.client import Client
+from rosbridge_eth.channel.events import Event
+from rosbridge_eth.channel.server import Server
 from rosbridge_eth.errors import NetworkError
 
 RECEIVE_BUFFER = 4 << 20  # bytes: about 3,500 full datagrams while the process is busy elsewhere
 SEND_BUFFER = 1 << 20
 LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
 BATCH = 128  # datagrams taken before events are handed out and answers sent
-LONGEST_WAIT = 1.0  # s
 
 _SO_REUSEPORT = getattr(socket, "SO_REUSEPORT", None)
 _SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
@@ -124,43 +122,27 @@ def _steer(sock: socket.socket, workers: int) -> bool:
 
 
 class UdpLoop:
-    """Drives one endpoint over one socket, in one thread.
+    """Drives one endpoint over one socket, in one thread; on_event is called with each event.
 
-    on_event is called with each event. on_batch, if given, is called with
-    `now` when all events at hand were given out: the place to commit a group
-    and reply. `submit` may be called from any thread; all else from the
-    loop's own.
+    `wake` may be called from any thread; all else from the loop's own.
     """
 
     def __init__(
-        self,
-        endpoint: Endpoint,
-        sock: socket.socket,
-        on_event: Callable[[Event], None],
-        *,
-        on_batch: Callable[[float], None] | None = None,
+        self, endpoint: Client | Server, sock: socket.socket, on_event: Callable[[Event], None], *,
         clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.endpoint = endpoint
         self.socket = sock
         self.lost_sends = 0
         """Datagrams that the system did not take."""
         self._on_event = on_event
-        self._on_batch = on_batch
         self._clock = clock
-        self._calls: deque[Callable[[float], None]] = deque()
         self._wake_receive, self._wake_send = socket.socketpair()
         self._wake_receive.setblocking(False)
         self._wake_send.setblocking(False)
         self._poll = select.poll()
         self._poll.register(sock, select.POLLIN)
         self._poll.register(self._wake_receive, select.POLLIN)
-        self._stop = threading.Event()
-
-    def submit(self, call: Callable[[float], None]) -> None:
-        """Have `call(now)` called in the loop's thread, soon."""
-        self._calls.append(call)
-        self.wake()
 
     def wake(self) -> None:
         """Make a waiting `step` return, from any thread or a signal handler; nothing happens once it is closed."""
@@ -171,27 +153,13 @@ class UdpLoop:
         except BlockingIOError:
             return  # wake-ups enough are waiting already
 
-    def stop(self) -> None:
-        """Let `run` return after its present step, from any thread."""
-        self._stop.set()
-        self.wake()
-
-    def run(self) -> None:
-        """Go on until `stop`."""
-        while not self._stop.is_set():
-            self.step(LONGEST_WAIT)
-        self._flush(self._clock())
-
     def step(self, longest: float) -> None:
         """Send what may be sent; wait for something, at most `longest` seconds; take it and give out its events."""
         endpoint, clock = self.endpoint, self._clock
         now = clock()
-        self._give_out(now)
-        self._flush(now)
+        self._turn(now)
         when = endpoint.next_timer()
         wait = longest if when is None else min(longest, max(0.0, when - now))
-        if self._calls:
-            wait = 0.0
         # Rounded up to a millisecond: to wake too early would be to wait in circles.
         ready = self._poll.poll(int(wait * 1000 + 0.999))
         now = clock()
@@ -199,27 +167,18 @@ class UdpLoop:
             if descriptor == self.socket.fileno():
                 self._receive(now)
             else:
-                self._drain_wakeups()
-        while self._calls:
-            self._calls.popleft()(now)
+                self._wake_receive.recv(4096)
         when = endpoint.next_timer()
         if when is not None and when <= now:
             endpoint.handle_timer(now)
-        self._give_out(now)
-        self._flush(clock())
+        self._turn(now)
 
     def close(self) -> None:
-        """Close the socket and what belongs to the loop."""
+        """Send what the endpoint still has to say, and close the socket and what belongs to the loop."""
+        self._turn(self._clock())
         self.socket.close()
         self._wake_receive.close()
         self._wake_send.close()
-
-    def _drain_wakeups(self) -> None:
-        try:
-            while self._wake_receive.recv(4096):
-                pass
-        except BlockingIOError:
-            return
 
     def _receive(self, now: float) -> None:
         receive, take = self.socket.recvfrom, self.endpoint.receive_datagram
@@ -234,15 +193,10 @@ class UdpLoop:
                 raise NetworkError(f"the socket cannot be read: {error.strerror}") from error
             take(data, (place[0], place[1]), now)
 
-    def _give_out(self, now: float) -> None:
-        any_event = False
+    def _turn(self, now: float) -> None:
+        """Give out every event there is, and send what may be sent."""
         while (event := self.endpoint.next_event()) is not None:
-            any_event = True
             self._on_event(event)
-        if any_event and self._on_batch is not None:
-            self._on_batch(now)
-
-    def _flush(self, now: float) -> None:
         send = self.socket.sendto
         for data, address in self.endpoint.datagrams_to_send(now):
             try:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 VERSION = 2
 DATAGRAM_SIZE = 1200
@@ -78,22 +78,9 @@ class Hello(NamedTuple):
 
     @staticmethod
     def parse(data: bytes) -> Hello:
-        if len(data) != DATAGRAM_SIZE or data[_HELLO.size :] != _HELLO_PADDING:
+        if data[_HELLO.size :] != _HELLO_PADDING:
             raise Malformed("a HELLO is 1,200 bytes, zeros after its fields")
-        _, version, mode, cid, nonce = _HELLO.unpack_from(data)
-        return _hello(version, mode, cid, nonce)
-
-
-def _hello(version: int, mode: int, cid: bytes, nonce: bytes) -> Hello:
-    _check_version(version)
-    if mode not in (1, 2):
-        raise Malformed("a mode that does not exist")
-    return Hello(Mode(mode), cid, nonce)
-
-
-def _check_version(version: int) -> None:
-    if version != VERSION:
-        raise Malformed("another version")
+        return _hello(*_unpacked(_HELLO, data[: _HELLO.size]))
 
 
 class Cookie(NamedTuple):
@@ -108,11 +95,7 @@ class Cookie(NamedTuple):
 
     @staticmethod
     def parse(data: bytes) -> Cookie:
-        if len(data) != _COOKIE.size:
-            raise Malformed("a COOKIE has another length")
-        _, version, *parts = _COOKIE.unpack(data)
-        _check_version(version)
-        return Cookie(*parts)
+        return Cookie(*_unpacked(_COOKIE, data))
 
 
 class Refusal(NamedTuple):
@@ -127,13 +110,26 @@ class Refusal(NamedTuple):
 
     @staticmethod
     def parse(data: bytes) -> Refusal:
-        if len(data) != _REFUSAL.size:
-            raise Malformed("a REFUSAL has another length")
-        _, version, cid, nonce, reason = _REFUSAL.unpack(data)
-        _check_version(version)
+        cid, nonce, reason = _unpacked(_REFUSAL, data)
         if reason not in Reason.__members__.values():
             raise Malformed("a reason that does not exist")
         return Refusal(cid, nonce, Reason(reason))
+
+
+def _unpacked(layout: struct.Struct, data: bytes) -> tuple[Any, ...]:
+    """The fields behind kind and version."""
+    if len(data) != layout.size:
+        raise Malformed("a handshake message has another length")
+    _, version, *rest = layout.unpack(data)
+    if version != VERSION:
+        raise Malformed("another version")
+    return tuple(rest)
+
+
+def _hello(mode: int, cid: bytes, nonce: bytes) -> Hello:
+    if mode not in Mode.__members__.values():
+        raise Malformed("a mode that does not exist")
+    return Hello(Mode(mode), cid, nonce)
 
 
 # PROOF and OFFER: handshake messages in pieces
@@ -154,10 +150,8 @@ def proof_datagrams(hello: Hello, cookie: bytes, body: bytes) -> list[bytes]:
 
 def parse_proof(data: bytes) -> tuple[Hello, bytes, Piece]:
     """The HELLO's fields, the cookie, and the piece."""
-    if not _PROOF.size < len(data) <= DATAGRAM_SIZE:
-        raise Malformed("a PROOF has another length")
-    _, version, mode, cid, nonce, cookie, index, count = _PROOF.unpack_from(data)
-    return _hello(version, mode, cid, nonce), cookie, _piece(index, count, data[_PROOF.size :])
+    mode, cid, nonce, cookie, index, count = _unpacked(_PROOF, data[: _PROOF.size])
+    return _hello(mode, cid, nonce), cookie, _piece(index, count, data[_PROOF.size :])
 
 
 def offer_datagrams(client_cid: bytes, body: bytes) -> list[bytes]:
@@ -168,16 +162,13 @@ def offer_datagrams(client_cid: bytes, body: bytes) -> list[bytes]:
 
 def parse_offer(data: bytes) -> tuple[bytes, Piece]:
     """The client's connection id, and the piece."""
-    if not _OFFER.size < len(data) <= DATAGRAM_SIZE:
-        raise Malformed("an OFFER has another length")
-    _, version, cid, index, count = _OFFER.unpack_from(data)
-    _check_version(version)
+    cid, index, count = _unpacked(_OFFER, data[: _OFFER.size])
     return cid, _piece(index, count, data[_OFFER.size :])
 
 
 def _piece(index: int, count: int, data: bytes) -> Piece:
-    if not index < count <= MAX_PIECES:
-        raise Malformed("a piece that does not exist")
+    if not index < count <= MAX_PIECES or not 0 < len(data) < DATAGRAM_SIZE:
+        raise Malformed("a piece that does not exist, or is empty or too long")
     return index, count, data
 
 

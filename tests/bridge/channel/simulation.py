@@ -10,7 +10,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rosbridge_eth.channel import Address, Endpoint, Event
+from rosbridge_eth.channel import Address, Client, Event, Server
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Faults:
 class Host:
     """An endpoint at an address, and what is done with its events."""
 
-    def __init__(self, endpoint: Endpoint, address: Address, on_event: Callable[[Event], None]) -> None:
+    def __init__(self, endpoint: Client | Server, address: Address, on_event: Callable[[Event], None]) -> None:
         self.endpoint = endpoint
         self.address = address
         self.on_event = on_event
@@ -54,7 +54,7 @@ class Network:
         self._calls: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
 
-    def attach(self, endpoint: Endpoint, address: Address, on_event: Callable[[Event], None]) -> Host:
+    def attach(self, endpoint: Client | Server, address: Address, on_event: Callable[[Event], None]) -> Host:
         host = Host(endpoint, address, on_event)
         self.hosts.append(host)
         return host

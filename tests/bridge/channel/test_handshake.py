@@ -45,7 +45,6 @@ from rosbridge_eth.channel.handshake import (
     ClientHandshake,
     HandshakeRefused,
     ServerHandshake,
-    VerifiedCertificates,
 )
 from rosbridge_eth.channel.wire import Hello
 
@@ -201,7 +200,7 @@ def proof_and_offer(mode):
     client = ClientHandshake(mode, robot(), b"clientid", randomness)
     cookie = bytes(24)
     proof = client.proof(cookie)
-    known = VerifiedCertificates(trust(), capacity=8, recheck=600.0)
+    known = trust()
 
     def serve(body: bytes) -> ServerHandshake:
         return ServerHandshake(
@@ -209,12 +208,11 @@ def proof_and_offer(mode):
             cookie,
             body,
             identity=hub(),
-            certificates=known,
+            trust=known,
             roles=(ids.Role.ROBOT,),
             server_cid=b"serverid",
             randomness=randomness,
             at=TODAY,
-            now=0.0,
         )
 
     return client, proof, serve, known
@@ -231,13 +229,13 @@ def test_no_altered_proof_or_offer_is_accepted(mode, seed):
     server = serve(proof)
     for bit in draw.sample(range(len(server.offer) * 8), 60):
         with pytest.raises(HandshakeRefused):
-            client.accept(flipped(server.offer, bit), known, server_name="hub", at=TODAY, now=0.0)
+            client.accept(flipped(server.offer, bit), known, server_name="hub", at=TODAY)
     for length in draw.sample(range(len(server.offer)), 60):
         with pytest.raises(HandshakeRefused):
-            client.accept(server.offer[:length], known, server_name="hub", at=TODAY, now=0.0)
+            client.accept(server.offer[:length], known, server_name="hub", at=TODAY)
         with pytest.raises(HandshakeRefused):
             serve(proof[: min(length, len(proof) - 1)])
-    agreed = client.accept(server.offer, known, server_name="hub", at=TODAY, now=0.0)
+    agreed = client.accept(server.offer, known, server_name="hub", at=TODAY)
     for bit in range(256):
         with pytest.raises(HandshakeRefused):
             server.confirm(agreed.confirmation, flipped(agreed.finished, bit))
@@ -473,17 +471,3 @@ def test_a_session_stands_until_the_new_one_is_finished():
     assert isinstance(heard, Message) and heard.payload == b"still here"
     second.to_server(finished)
     assert [type(event) for event in events(server)] == [Disconnected, Connected]
-
-
-def test_a_verified_certificate_is_not_verified_again_but_still_looked_at():
-    calls = []
-
-    class Counting(ids.Trust):
-        def examine(self, signing_der, encryption_der, *, at):
-            calls.append(at)
-            return super().examine(signing_der, encryption_der, at=at)
-
-    server = make_server(1000.0, trust=Counting((authority("operator").certificate,)))
-    for _ in range(3):
-        Steps(server=server).until_connected()
-    assert len(calls) == 1

@@ -7,6 +7,7 @@ and what it can make this end hold is bounded.
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 
 import pytest
 
@@ -148,7 +149,7 @@ def test_messages_are_cut_out_of_any_segments_and_segments_come_in_any_order():
         draw = random.Random(seed)
         steps = connected()
         cuts = sorted({0, len(whole), *(draw.randrange(len(whole)) for _ in range(draw.randrange(30)))})
-        pieces = [whole[a:b] for a, b in zip(cuts, cuts[1:], strict=False)]
+        pieces = [whole[a:b] for a, b in pairwise(cuts)]
         pieces = [p[i : i + SEGMENT_SIZE] for p in pieces for i in range(0, len(p), SEGMENT_SIZE)]
         numbered = list(enumerate(pieces, 1))
         draw.shuffle(numbered)
@@ -177,7 +178,6 @@ def test_clients_that_fill_the_servers_memory_do_not_keep_others_out():
         client = make_client(1000.0, None, robot(f"robot_{number}"))
         steps = Steps(server=server, client=client).until_connected()
         for index in range(2, 400):
-            [connection] = [c for c in server._connections.values() if c.peer.name == f"robot_{number}"]
             steps.to_server(client._session._seal(segment(index, bytes(1000))))
     kept = RESERVED_SEGMENTS * (SEGMENT_SIZE + 100)
     assert server.statistics().held_bytes <= 120_000 + 4 * kept

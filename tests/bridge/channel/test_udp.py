@@ -38,31 +38,30 @@ PATIENCE = 30.0  # s, until a test gives up
 
 
 class Worker:
-    """A server process, as a thread."""
+    """A server process, as a thread; it sends every message back, reversed."""
 
     def __init__(self, number: int, sock: socket.socket) -> None:
-        self.server = Server(
-            ServerConfig(worker=number), HUB, TRUST, cookie_key(HUB), time.monotonic()
-        )
+        self.server = Server(ServerConfig(worker=number), HUB, TRUST, cookie_key(HUB), time.monotonic())
         self.events: list[object] = []
-        self.batch: list[Message] = []
-        self.loop = UdpLoop(self.server, sock, self.on_event, on_batch=self.commit)
-        self.thread = threading.Thread(target=self.loop.run)
+        self.loop = UdpLoop(self.server, sock, self.on_event)
+        self.stopped = threading.Event()
+        self.thread = threading.Thread(target=self.run)
         self.thread.start()
+
+    def run(self) -> None:
+        while not self.stopped.is_set():
+            self.loop.step(10.0)
 
     def on_event(self, event: object) -> None:
         self.events.append(event)
         if isinstance(event, Message):
-            self.batch.append(event)
-
-    def commit(self, now: float) -> None:
-        for event in self.batch:
             self.server.send(event.connection, event.payload[::-1])
-        self.batch.clear()
 
     def stop(self) -> None:
-        self.loop.stop()
-        self.thread.join()
+        self.stopped.set()
+        self.loop.wake()
+        self.thread.join(5.0)
+        assert not self.thread.is_alive()
         self.loop.close()
 
 
@@ -142,10 +141,17 @@ def test_a_robot_that_moves_stays_with_its_worker(workers):
     robot.loop.close()
 
 
-def test_work_is_handed_over_from_another_thread(workers):
-    called = threading.Event()
-    workers[0].loop.submit(lambda now: called.set())
-    assert called.wait(PATIENCE)
+def test_a_loop_that_is_closed_sends_what_its_endpoint_still_has_to_say(workers):
+    robot = Robot(ROBOTS[0], port_of(workers))
+    robot.connect()
+    assert sum(worker.server.statistics().connections for worker in workers) == 1
+    robot.client.close(time.monotonic())
+    robot.loop.close()
+    end = time.monotonic() + PATIENCE
+    while any(worker.server.statistics().connections for worker in workers) and time.monotonic() < end:
+        workers[0].thread.join(0.01)
+    assert not any(worker.server.statistics().connections for worker in workers)
+    robot.loop.wake()  # harmless now
 
 
 def test_a_port_in_use_is_an_error_with_a_way_out(workers):
