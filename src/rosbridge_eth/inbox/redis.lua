@@ -8,10 +8,10 @@ number is 8 bytes, big-endian.
   meta           hash    id (random, made with the inbox), ledger, bytes (of all rows)
   robots         hash    ROBOT -> bytes of its rows, of all of which there ever was a row or a state
   state:ROBOT    string  JSON
-  log:ROBOT      Stream  the robot's rows, in order, with Redis' own ids:
-                           d digest of the header, h keccak256 of the chunk, p stream and number, z size, r records,
-                           a taken at; C, R, B: chunks, records and bytes ever taken, with this row, so that what
-                           lies between two rows need not be counted
+  log:ROBOT      Stream  the robot's rows, in order, with Redis' own ids; one field r, packed, big-endian:
+                           digest of the header 32, keccak256 of the chunk 32, stream 16, number 8, size 4, records 4,
+                           taken at 8 (double); then C, R, B, 8 each: chunks, records and bytes ever taken, with this
+                           row, so that what lies between two rows need not be counted
   ever:ROBOT     hash    C, R, B
   chunks:ROBOT   hash    digest -> the encoded chunk
   places:ROBOT   hash    keccak256 -> entry of `log`; stream and number -> digest
@@ -21,17 +21,12 @@ number is 8 bytes, big-endian.
 At `maxmemory` Redis refuses a script's first write if it takes memory, and looks at no other. `append` begins with
 one that does, and is refused whole; the others begin with one that frees, and go through: a full Redis drains.
 ]]
-local operation, id, run_id, robot = unpack(ARGV)
+local operation, id, run_id, robot = unpack(ARGV, 1, 4)
 local P = KEYS[1]
 local META, ROBOTS, LOG, EVER = P .. 'meta', P .. 'robots', P .. 'log:' .. robot, P .. 'ever:' .. robot
 local CHUNKS, PLACES, HEADS = P .. 'chunks:' .. robot, P .. 'places:' .. robot, P .. 'heads:' .. robot
+local ROW = '>c32c32c24I4I4dI8I8I8'
 local call = redis.call
-
-local function table_of(flat)
-  local fields = {}
-  for i = 1, #flat, 2 do fields[flat[i]] = flat[i + 1] end
-  return fields
-end
 
 -- Whether the 8-byte number a is above b. Lua's own comparison asks the locale.
 local function above(a, b)
@@ -44,8 +39,8 @@ end
 local function add(row, encoded)
   local chunks = call('HINCRBY', EVER, 'C', 1)
   local records, bytes = call('HINCRBY', EVER, 'R', row.r), call('HINCRBY', EVER, 'B', row.z)
-  local entry = call('XADD', LOG, '*', 'd', row.d, 'h', row.h, 'p', row.p, 'z', row.z, 'r', row.r, 'a', row.a,
-    'C', chunks, 'R', records, 'B', bytes)
+  local entry = call('XADD', LOG, '*', 'r',
+    struct.pack(ROW, row.d, row.h, row.p, row.z, row.r, row.a, chunks, records, bytes))
   call('HSET', PLACES, row.h, entry, row.p, row.d)
   if encoded then
     call('HSET', CHUNKS, row.d, encoded)
@@ -54,9 +49,15 @@ local function add(row, encoded)
   end
 end
 
--- Remove an entry of `log`, {id, fields}, and its chunk, which becomes a dead letter if there is a reason.
+-- The row in an entry of `log`, {id, {'r', row}}
+local function read(entry)
+  local digest, hash, place, size, records, taken_at = struct.unpack(ROW, entry[2][2])
+  return {d = digest, h = hash, p = place, z = size, r = records, a = taken_at}
+end
+
+-- Remove an entry of `log` and its chunk, which becomes a dead letter if there is a reason.
 local function remove(entry, tk, why)
-  local row = table_of(entry[2])
+  local row = read(entry)
   if why then
     call('XADD', P .. 'dead', '*', 't', tk, 'w', why, 'a', row.a, 'c', call('HGET', CHUNKS, row.d))
   end
@@ -124,7 +125,7 @@ elseif operation == 'put_in_front' then -- now count {as of append} {digest on t
   local gone, rest, on_chain = {}, {}, 7 + 7 * ARGV[6]
   for i = on_chain, #ARGV do gone[ARGV[i]] = true end
   for _, entry in ipairs(call('XRANGE', LOG, '-', '+')) do
-    local row = table_of(entry[2])
+    local row = read(entry)
     if gone[row.d] then remove(entry) else rest[#rest + 1] = row end
   end
   call('DEL', LOG)

@@ -10,7 +10,9 @@ A position is the id of an entry of the robot's Stream: milliseconds and a count
 from __future__ import annotations
 
 import hashlib
+import operator
 import secrets
+import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -29,6 +31,7 @@ from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import DEAD_LETTERS, DeadLetter, Head, Inbox, InboxExchanged, Outcome, Row, Waiting
 
 _OUTCOMES: Final = {"S": Outcome.STORED, "K": Outcome.KNOWN, "D": Outcome.DIFFERENT, "F": Outcome.FULL}
+_ROW: Final = struct.Struct(">32s32s24sIIdQQQ")  # see `log` in redis.lua
 _SETTINGS: Final = {
     "appendonly": "yes",
     "appendfsync": "always",
@@ -154,17 +157,18 @@ class RedisInbox(Inbox):
     def rows(self, tk: bytes, after: int | None, limit: int) -> list[Row]:
         with self._talking():
             found = self._redis.xrange(self._key("log", tk), _behind(after), "+", limit)
-        return [
-            Row(_position(entry), row[b"d"], row[b"h"], int(row[b"z"]), float(row[b"a"]), int(row[b"r"]))
-            for entry, row in found
-        ]
+        rows: list[Row] = []
+        for entry, fields in found:
+            digest, hash, _, size, records, taken_at, *_ = _ROW.unpack(fields[b"r"])
+            rows.append(Row(_position(entry), digest, hash, size, taken_at, records))
+        return rows
 
     def chunks(self, tk: bytes, positions: Collection[int]) -> list[bytes]:
         with self._talking():
             pipe = self._redis.pipeline(transaction=False)
             for position in positions:
                 pipe.xrange(self._key("log", tk), _entry(position), _entry(position))
-            digests = [row[b"d"] for entries in pipe.execute() for _, row in entries]
+            digests = [fields[b"r"][:32] for entries in pipe.execute() for _, fields in entries]
             found = self._redis.hmget(self._key("chunks", tk), digests) if digests else []
         if len(digests) != len(positions) or None in found:
             raise StoreError(f"the inbox in {self._place} has no such row any more")
@@ -178,9 +182,9 @@ class RedisInbox(Inbox):
             first, last = pipe.execute()
         if not first:
             return Waiting(0, 0, 0, None)
-        (_, begin), (_, end) = first[0], last[0]
-        chunks, records, size = (int(end[name]) - int(begin[name]) for name in (b"C", b"R", b"B"))
-        return Waiting(chunks + 1, records + int(begin[b"r"]), size + int(begin[b"z"]), float(begin[b"a"]))
+        _, _, _, size, records, oldest, *begin = _ROW.unpack(first[0][1][b"r"])
+        chunks, more_records, more_bytes = map(operator.sub, _ROW.unpack(last[0][1][b"r"])[6:], begin)
+        return Waiting(chunks + 1, more_records + records, more_bytes + size, oldest)
 
     def dead(self, limit: int = 100) -> list[DeadLetter]:
         with self._talking():

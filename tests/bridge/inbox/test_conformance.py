@@ -337,6 +337,18 @@ def test_what_a_reorganisation_may_take_back_becomes_rows_too(inbox):
     assert len(held(inbox)) == 10
 
 
+def test_a_long_history_is_no_obstacle(inbox):
+    heads = {n.to_bytes(16, "big"): Head(n, bytes(32)) for n in range(1, 10_000)}
+    on_chain = [n.to_bytes(32, "big") for n in range(50_000)]
+    put(inbox, [chunk(n, size=0) for n in range(3000)])
+    inbox.rebase(A, chunk(2999, size=0), on_chain, heads, T0)
+    assert (len(rows(inbox)), inbox.head(A, (9999).to_bytes(16, "big"))) == (3000, Head(9999, bytes(32)))
+    assert [one.header.number for one in held(inbox)[:2]] == [2999, 0]
+    inbox.confirm(A, rows(inbox)[-1].position, T0)
+    inbox.forget(T0 + 1)
+    assert len(rows(inbox)) == 1
+
+
 def test_heads_are_raised_and_never_lowered(inbox):
     put(inbox, chain(3))
     inbox.raise_heads(A, {STREAM: Head(1, b"1" * 32), OTHER: Head(0, b"0" * 32)}, T0)
