@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -19,6 +19,7 @@ from rosbridge_eth.chunk import MAX_TIME_MS, Log
 from rosbridge_eth.config.values import duration_text, time_text
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.files import write_atomically
+from smcrypto import sm2
 
 MAX_FINDINGS: Final = 500
 """Findings kept one by one; what is above that is counted by kind."""
@@ -105,17 +106,17 @@ class Head(NamedTuple):
     goodbye: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Bookmark:
-    """What a reader keeps of a robot's log, so that it cannot be shown another one, nor has to read all again.
+    """How far a reading has come; kept, so that the reader cannot be shown another log nor has to read all again.
 
     count: chunks read. digest: hex of the last one's identity. block: of it, which a reorganisation may change.
     fingerprints: certificates that were accepted. head, records, found, types: with what a reading goes on after
     `count`; types are the lines of the definitions, by type name.
     """
 
-    count: Annotated[int, Field(ge=0)]
-    digest: str
+    count: Annotated[int, Field(ge=0)] = 0
+    digest: str = ""
     block: int = 0
     fingerprints: tuple[str, ...] = ()
     head: Head | None = None
@@ -164,21 +165,32 @@ def _key(log: Log) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Governing:
-    """A registration or revocation, and from which chunk on it holds. fingerprint: SM3 of the signing certificate."""
+    """A registration or revocation, and from which chunk on it holds. fingerprint: SM3 of the signing certificate.
+
+    key: None where the certificates are not to be trusted, and `why`. Times are milliseconds since 1970.
+    """
 
     first: int
     block: int
     account: str
     fingerprint: str
     revoked: bool
-    trusted: bool
     new: bool
+    key: sm2.PublicKey | None
+    why: str
+    begins_ms: int
+    ends_ms: int
 
     def __str__(self) -> str:
         if self.revoked:
             return f"revoked from chunk {self.first} on, in block {self.block}"
-        remarks = ("" if self.trusted else ", NOT TRUSTED") + (", NEW to this reader" if self.new else "")
-        return f"from chunk {self.first} on, in block {self.block}: {grouped(self.fingerprint)}{remarks}"
+        new = ", NEW to this reader" if self.new else ""
+        bad = f", NOT TRUSTED: {self.why}" if self.key is None else ""
+        return f"from chunk {self.first} on, in block {self.block}: {grouped(self.fingerprint)}{new}{bad}"
+
+    def as_json(self) -> dict[str, Any]:
+        shown = {name: getattr(self, name) for name in ("first", "block", "account", "fingerprint", "revoked", "new")}
+        return shown | {"trusted": self.key is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,11 +244,12 @@ class Verdict:
         yield from (f"  {node}" for node in self.nodes)
 
     def as_json(self) -> dict[str, Any]:
-        value = asdict(self) | {"counts": dict(self.counts)}
+        value = {each.name: getattr(self, each.name) for each in fields(self)}
         value["head"] = None if self.head is None else self.head._asdict()
-        for finding, kept in zip(value["findings"], self.findings, strict=True):
-            finding["kind"] = kept.kind.label
-            finding["violation"] = kept.kind.violation
+        value["certificates"] = [one.as_json() for one in self.certificates]
+        value["findings"] = [
+            asdict(one) | {"kind": one.kind.label, "violation": one.kind.violation} for one in self.findings
+        ]
         return value
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -44,7 +45,7 @@ CLOCK_AHEAD_MS: Final = 300_000
 """A chunk that was sealed so much later than its block, by the clocks of robot and chain, is told."""
 CLOCK_BACK_MS: Final = 1_000
 """What a clock may be set back between two chunks without being told: what NTP does by itself."""
-MAX_TYPES: Final = 1_000
+MAX_TYPES: Final = 256
 MAX_ELSEWHERE: Final = 16
 NO_DIGEST: Final = bytes(32)
 LAST_MOMENT: Final = 253_402_300_799
@@ -84,16 +85,6 @@ class ProvenChunk:
     records: tuple[ProvenRecord, ...] = field(repr=False)
 
 
-class _Signer(NamedTuple):
-    """A registration as far as it is to be trusted; key: None where it is not. Times are milliseconds since 1970."""
-
-    governing: Governing
-    key: sm2.PublicKey | None
-    why: str
-    begins_ms: int
-    ends_ms: int
-
-
 class Verifier:
     """Reads one robot's log once: `read` gives what is proven, then `verdict` and `bookmark` say how it ended.
 
@@ -125,27 +116,25 @@ class Verifier:
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
-        begin = mark if resume and mark is not None else Bookmark(0, "")
-        self.findings = Findings(begin.found)
-        self._count, self._records, self._head = begin.count, begin.records, begin.head
-        self._digest, self._last_block = begin.digest, begin.block
-        self._types = {name: _type_line(line) for name, line in begin.types.items()}
-        self._type_lines = dict(begin.types)
+        self._at = deepcopy(mark) if resume and mark is not None else Bookmark()
+        self.findings = Findings(self._at.found)
+        self._types = {name: _type_line(line) for name, line in self._at.types.items()}
         self._digests, self._indices = array("Q"), array("Q")  # of the robot's chunks: first 8 bytes, and where
         self._broken = False
-        if self._head is not None:
-            self._remember(self._count - 1, bytes.fromhex(self._head.digest))
+        if self._at.head is not None:
+            self._remember(self._at.count - 1, bytes.fromhex(self._at.head.digest))
         self._marked = mark is None or mark.count == 0  # whether the mark's chunk was compared
         self._timed = -1, 0  # the latest block and its time
         self._signers = [self._signer(event) for event in registrations]
-        self._current = -1  # the signer that governs the chunk at self._count
+        self._current = -1  # the one of them that governs the next chunk
         self._check_registrations(registrations)
         if mark is not None and mark.count > standing.chunks:
-            self._roll_back(standing.chunks, f"{mark.count:,} chunks then, {standing.chunks:,} now")
+            detail = f"{mark.count:,} chunks then, {standing.chunks:,} now"
+            self.findings.add(Kind.ROLLED_BACK, standing.chunks, detail=detail)
 
     # --- certificates
 
-    def _signer(self, event: RegistrationEvent) -> _Signer:
+    def _signer(self, event: RegistrationEvent) -> Governing:
         """Trusted if the certificates are the robot's, of the CA, and had not ended when they were registered.
 
         They may begin later than their block's time: that is a chain whose clock is behind.
@@ -167,8 +156,7 @@ class Verifier:
         if new:
             self.findings.add(Kind.NEW_CERTIFICATE, event.index, detail=fingerprint)
         account = shown(event.account)
-        governing = Governing(event.index, event.block, account, fingerprint, event.revoked, key is not None, new)
-        return _Signer(governing, key, why, begins, ends)
+        return Governing(event.index, event.block, account, fingerprint, event.revoked, new, key, why, begins, ends)
 
     def _check_registrations(self, events: Sequence[RegistrationEvent]) -> None:
         """The events are linked, and the contract has the newest certificates' hash: a node cannot hide one."""
@@ -183,8 +171,8 @@ class Verifier:
             detail = "a registration or revocation: the node does not show what the contract has"
             self.findings.add(Kind.WITHHELD, standing.chunks, detail=detail)
 
-    def _governing(self, index: int) -> _Signer | None:
-        while self._current + 1 < len(self._signers) and self._signers[self._current + 1].governing.first <= index:
+    def _governing(self, index: int) -> Governing | None:
+        while self._current + 1 < len(self._signers) and self._signers[self._current + 1].first <= index:
             self._current += 1
         return self._signers[self._current] if self._current >= 0 else None
 
@@ -199,37 +187,31 @@ class Verifier:
         """What is proven, in the order of the log. events: oldest first."""
         end, last = self._standing.chunks, b""
         for event in events:
-            if event.first > self._count:
+            if event.first > self._at.count:
                 self._withhold(min(event.first, end))
             for index, encoded in enumerate(event.chunks, event.first):
                 if index >= end:
                     return  # came after the block that is looked at
                 if self._mark is not None and index == self._mark.count - 1:
-                    self._check_mark(index, encoded)
-                if index < self._count:
+                    self._marked = True
+                    if _identity(encoded) != self._mark.digest:
+                        self.findings.add(Kind.ROLLED_BACK, index, detail="another chunk than then")
+                if index < self._at.count:
                     continue
-                self._count, self._last_block, last = index + 1, event.block, encoded
+                self._at.count, self._at.block, last = index + 1, event.block, encoded
                 proven = self._chunk(index, encoded, event)
                 if proven is not None:
                     yield proven
-                if self._count == end and keccak(last) != self._standing.tail:
+                if self._at.count == end and keccak(last) != self._standing.tail:
                     self.findings.add(Kind.ALTERED, index, detail="the contract has another hash of its last chunk")
         self._withhold(end)
         if not self._marked and self._mark is not None and self._mark.count <= end:
             self.findings.add(Kind.WITHHELD, self._mark.count - 1, detail="the last chunk of the reading before")
 
     def _withhold(self, until: int) -> None:
-        if until > self._count:
-            self.findings.add(Kind.WITHHELD, self._count, until - 1, count=until - self._count)
-            self._count = until
-
-    def _roll_back(self, index: int, detail: str) -> None:
-        self.findings.add(Kind.ROLLED_BACK, index, detail=detail)
-
-    def _check_mark(self, index: int, encoded: bytes) -> None:
-        self._marked = True
-        if self._mark is not None and _identity(encoded) != self._mark.digest:
-            self._roll_back(index, "another chunk than then")
+        if until > self._at.count:
+            self.findings.add(Kind.WITHHELD, self._at.count, until - 1, count=until - self._at.count)
+            self._at.count = until
 
     def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk | None:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
@@ -237,11 +219,11 @@ class Verifier:
         try:
             chunk = Chunk.parse(encoded)
         except Malformed as error:
-            self._digest = sm3.digest(encoded).hex()
+            self._at.digest = sm3.digest(encoded).hex()
             self.findings.add(Kind.MALFORMED, index, detail=shown(str(error)))
             return None
         header = chunk.header
-        self._digest = header.digest.hex()
+        self._at.digest = header.digest.hex()
         if signer is None or signer.key is None:
             why = "no certificate is registered" if signer is None else signer.why
             self.findings.add(Kind.UNTRUSTED, index, detail=why)
@@ -257,7 +239,7 @@ class Verifier:
         if not self._follow(index, header):
             return None
         self._check_clock(index, header, signer, event.block)
-        self._head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
+        self._at.head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
         if chunk.body and sm3.digest(chunk.body) != header.body_digest:
             self.findings.add(Kind.ALTERED, index, detail="the body is not the one that the header names")
             return None
@@ -283,7 +265,7 @@ class Verifier:
 
     def _follow(self, index: int, header: Header) -> bool:
         """Tell where the chunk does not follow the newest one; False for one that was read already."""
-        head = self._head
+        head = self._at.head
         follows = header.previous == (NO_DIGEST if head is None else bytes.fromhex(head.digest))
         same_stream = head is not None and header.stream.hex() == head.stream
         ahead = header.number - (head.number + 1 if head is not None and same_stream else 0)
@@ -316,13 +298,13 @@ class Verifier:
         else:
             self.findings.add(Kind.MISSING, index, detail=f"what {where} follows; it may be more than one")
 
-    def _check_clock(self, index: int, header: Header, signer: _Signer, block: int) -> None:
+    def _check_clock(self, index: int, header: Header, signer: Governing, block: int) -> None:
         sealed = header.sealed_ms
         if sealed > self._time(block) * 1000 + CLOCK_AHEAD_MS:
             self.findings.add(Kind.CLOCK, index, detail="sealed later than its block was made")
         if sealed < signer.begins_ms:
             self.findings.add(Kind.CLOCK, index, detail="sealed before the robot's certificate began")
-        if self._head is not None and sealed < self._head.sealed_ms - CLOCK_BACK_MS:
+        if self._at.head is not None and sealed < self._at.head.sealed_ms - CLOCK_BACK_MS:
             self.findings.add(Kind.CLOCK, index, detail="sealed before the chunk that it follows")
 
     # --- content
@@ -342,7 +324,7 @@ class Verifier:
             self.findings.add(Kind.UNOPENABLE, place.chunk, detail=shown(str(error)))
             return None
         records = tuple(self._parsed(place, lines))
-        self._records += len(records)
+        self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
 
     def _parsed(self, place: Place, lines: Sequence[bytes]) -> Iterator[ProvenRecord]:
@@ -360,7 +342,7 @@ class Verifier:
                 case TypeLine():
                     if len(self._types) < MAX_TYPES or content.type_name in self._types:
                         self._types[content.type_name] = content
-                        self._type_lines[content.type_name] = line.decode()
+                        self._at.types[content.type_name] = line.decode()
                 case LostLine():
                     detail = f"{shown(content.topic)}: {shown(content.why)}"
                     self.findings.add(Kind.LOST, place.chunk, count=content.lost, detail=detail)
@@ -373,7 +355,7 @@ class Verifier:
     # --- how it ended
 
     def verdict(self, nodes: Sequence[str] = ()) -> Verdict:
-        head = self._head
+        head = self._at.head
         silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > self._heartbeat
         return Verdict(
             robot=self.name,
@@ -381,9 +363,9 @@ class Verifier:
             chunks=self._standing.chunks,
             block=self._block,
             head=head,
-            records=self._records,
+            records=self._at.records,
             counts=dict(self.findings.counts),
-            certificates=tuple(signer.governing for signer in self._signers),
+            certificates=tuple(self._signers),
             silent=silent,
             heartbeat=self._heartbeat,
             findings=tuple(self.findings.kept),
@@ -398,13 +380,10 @@ class Verifier:
         counts = self.findings.counts
         if counts[Kind.WITHHELD.label] or counts[Kind.ROLLED_BACK.label]:
             return self._mark
-        now = [signer.governing.fingerprint for signer in self._signers if signer.governing.fingerprint]
+        now = [signer.fingerprint for signer in self._signers if not signer.revoked]
         known = now if confirm or self._mark is None else self._mark.fingerprints
         found = {label: count for label, count in counts.items() if label != Kind.NEW_CERTIFICATE.label}
-        return Bookmark(
-            self._count, self._digest, self._last_block, tuple(dict.fromkeys(known)), self._head, self._records, found,
-            dict(self._type_lines),
-        )  # fmt: skip
+        return replace(deepcopy(self._at), fingerprints=tuple(dict.fromkeys(known)), found=found)
 
 
 def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:

@@ -29,7 +29,7 @@ from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import Keyring, Ledger
-from rosbridge_eth.ledger.nodes import Anvil, start_anvil
+from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.reading import Verdict, read_robot
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
@@ -58,7 +58,7 @@ def anvil(require: Callable[[str], str]) -> Iterator[Anvil]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     try:
-        chain = start_anvil(port)
+        chain = Anvil.start(port)
     except ChainError as error:
         unavailable(str(error))
     with chain:

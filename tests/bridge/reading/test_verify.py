@@ -626,6 +626,12 @@ def test_findings_are_counted_beyond_those_that_are_kept():
     assert any("only the first 500 findings" in text for text in verdict.lines())
 
 
+def test_definitions_are_bounded():
+    rest = {"wire": "ros1", "format": "msg", "definition": "int8 x\n"}
+    lines = [line({"type": f"a/msg/T{n}"} | rest) for n in range(300)]
+    assert len(read([Pen().write(*lines, message(1))]).mark.types) == 256
+
+
 # --- terminals
 
 
