@@ -183,6 +183,13 @@ class OperatorHome:
         """The folder of the CA's key and certificate; `init` may have been given another than ours."""
         return self.path / str(home_of(self.path).get("ca", "ca"))
 
+    @property
+    def account(self) -> str:
+        """The operator's account on the chain, which accounts.json shows in the clear."""
+        mend = "restore it from your backup"
+        absent = ConfigError(f"{self.accounts} is missing; {mend}")
+        return str(_load(self.accounts, mend, absent).get("operator"))
+
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""
         home_of(self.path, HomeKind.OPERATOR, f"run `init --home {self.path}` first")

@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
+from dataclasses import fields
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -43,30 +43,35 @@ REGISTRY = CollectorRegistry()
 
 
 def _gauge(name: str, help: str, *labels: str) -> Gauge:
+    # Without a label it would stand at 0 in every process that has nothing to say of it.
     return Gauge(f"rosbridge_eth_{name}", help, labels, registry=REGISTRY, multiprocess_mode="mostrecent")
 
 
+BEAT = _gauge("beat_seconds", "When the process last took a turn, seconds since 1970.", "process")
+STARTS = _gauge("starts", "How often the process was started since the server was.", "process")
+CONDITION = _gauge("condition", "1 while the condition holds; /readyz lists them.", "name")
 CHANNEL = _gauge("channel", "Counts of the channel since the process began, by what was counted.", "process", "count")
 DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by reason.", "process", "reason")
-CHUNKS = _gauge("chunks", "Chunks that arrived, by what became of them.", "process", "outcome")
-STORED = _gauge("records_stored", "Records stored since the process began.", "process", "robot")
+
+CHUNKS = _gauge("chunks", "Chunks that arrived since the process began, by what became of them.", "process", "outcome")
+STORED = _gauge("records_stored", "Lines of the log stored since the process began.", "process", "robot")
+SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
 WAITING = _gauge("waiting_chunks", "Chunks in the inbox that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
 OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
-BALANCE = _gauge("treasury_eth", "Balance of the operator's account.")
 HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` says why.", "robot")
 SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "count")
-HEAD = _gauge("head_block", "Number of the node's latest block.")
-HEAD_AGE = _gauge("head_age_seconds", "Age of that block by its own timestamp.")
-DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the store is.")
-BEAT = _gauge("beat_seconds", "When the process last took a turn, seconds since 1970.", "process")
-CONDITION = _gauge("condition", "1 while the condition holds; /readyz lists them.", "name")
+BALANCE = _gauge("treasury_eth", "Balance of the operator's account.", "process")
+HEAD = _gauge("head_block", "Number of the node's latest block.", "process")
+HEAD_AGE = _gauge("head_age_seconds", "Age of that block by its own timestamp.", "process")
+DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the home is.", "process")
 
-CAPTURED = _gauge("captured", "Records captured since the process began.")
-LOST = _gauge("lost", "Messages that were not captured, by topic and why; the log says so, too.", "topic", "why")
-SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored by the server, set aside.", "state")
-SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.")
-CONNECTED = _gauge("connected", "1 while a session with the server stands.")
+CAPTURED = _gauge("captured", "Records captured since the robot was started.", "robot")
+LOST = _gauge("lost", "Messages not captured, by topic and why; the log says so, too.", "robot", "topic", "why")
+SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored there, set aside.", "robot", "state")
+SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.", "robot")
+SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave up since it was made.", "robot")
+CONNECTED = _gauge("connected", "1 while a session with the server stands.", "robot")
 
 
 def collected() -> CollectorRegistry:
@@ -181,17 +186,18 @@ class Web:
 
 
 def show_channel(process: str, counted: Statistics, lost_sends: int) -> None:
-    for name, value in asdict(counted).items():
-        if name == "dropped":
+    for field in fields(counted):
+        value = getattr(counted, field.name)
+        if field.name == "dropped":
             for reason, count in value.items():
                 DROPPED.labels(process, reason).set(count)
         else:
-            CHANNEL.labels(process, name).set(value)
+            CHANNEL.labels(process, field.name).set(value)
     CHANNEL.labels(process, "lost_sends").set(lost_sends)
 
 
 def show_worker(process: str, worker: Worker, wall: float) -> None:
-    """A worker's channel, and what became of the chunks that reached it."""
+    """A worker's channel and sessions, and what became of the chunks that reached it."""
     reception = worker.reception
     beat(process, wall)
     show_channel(process, reception.server.statistics(), worker.loop.lost_sends)
@@ -199,12 +205,17 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         CHUNKS.labels(process, outcome).set(count)
     for robot, records in reception.records.items():
         STORED.labels(process, robot).set(records)
+    for session in reception.sessions.values():
+        address = reception.server.address_of(session.connection)
+        if address is not None:  # without its port, which is another each time
+            SESSION.labels(session.peer.name, address[0]).set(wall)
     CONDITION.labels(f"{process} stores chunks").set(reception.trouble.why is None)
 
 
 def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str], folder: Path, wall: float) -> None:
     """What waits for the chain, and whether it gets there. Raises StoreError."""
-    beat("submitter", wall)
+    process = "submitter"
+    beat(process, wall)
     waiting = inbox.totals()
     for tk, name in names.items():
         held = waiting.get(tk, Waiting(0, 0, 0, None))
@@ -215,31 +226,33 @@ def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str
     for what, count in submitter.counts.items():
         SUBMITTER.labels(what).set(count)
     if submitter.head is not None:
-        HEAD.set(submitter.head.number)
-        HEAD_AGE.set(max(0.0, wall - submitter.head.time))
+        HEAD.labels(process).set(submitter.head.number)
+        HEAD_AGE.labels(process).set(max(0.0, wall - submitter.head.time))
     if submitter.operator_balance is not None:
-        BALANCE.set(submitter.operator_balance / WEI_PER_ETH)
+        BALANCE.labels(process).set(submitter.operator_balance / WEI_PER_ETH)
     room = shutil.disk_usage(folder).free
-    DISK_FREE.set(room)
+    DISK_FREE.labels(process).set(room)
     CONDITION.labels("node answers").set(submitter.trouble is None)
+    CONDITION.labels("chunks are confirmed").set(submitter.unconfirmed is None)
     CONDITION.labels("treasury can pay").set(submitter.funds is None)
     CONDITION.labels("disk has room").set(room >= LITTLE_ROOM)
 
 
-def show_robot(robot: Robot) -> None:
+def show_robot(name: str, robot: Robot, wall: float) -> None:
     """A robot's capture, spool and session. Raises StoreError."""
-    beat("robot", time.time())
+    beat("robot", wall)
     show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
-    CAPTURED.set(robot.captured)
+    CAPTURED.labels(name).set(robot.captured)
     for topic, count in robot.source.dropped.items():
-        LOST.labels(topic, "dropped").set(count)
+        LOST.labels(name, topic, "dropped").set(count)
     for topic, counted in robot.capture.statistics().items():
-        LOST.labels(topic, "refused").set(counted.refused + counted.undecodable)
+        LOST.labels(name, topic, "refused").set(counted.refused + counted.undecodable)
     spool = robot.spool.statistics()
     for state, chunks in (("all", spool.chunks), ("not stored", spool.unstored), ("set aside", spool.aside)):
-        SPOOL_CHUNKS.labels(state).set(chunks)
-    SPOOL_BYTES.set(spool.bytes)
-    CONNECTED.set(robot.sender.statistics.connected)
+        SPOOL_CHUNKS.labels(name, state).set(chunks)
+    SPOOL_BYTES.labels(name).set(spool.bytes)
+    SPOOL_DROPPED.labels(name).set(spool.dropped_bodies)
+    CONNECTED.labels(name).set(robot.sender.statistics.connected)
     CONDITION.labels("robot has a session").set(robot.sender.statistics.connected)
     CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)
 

@@ -15,6 +15,7 @@ import signal
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
@@ -138,6 +139,7 @@ class Supervisor:
         self._deployment = home.deployment()
         self._children: dict[str, BaseProcess] = {}
         self._started_at: dict[str, float] = {}
+        self._starts: Counter[str] = Counter()
         self._due: dict[str, float] = {}  # processes that ended, and when they are started again
         self._short_lives: dict[str, int] = {}
         self._stop = threading.Event()
@@ -197,7 +199,8 @@ class Supervisor:
             inbox.close()
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
-        process = _FORK.Process(target=_child, args=(task,), name=name, daemon=False)
+        self._starts[name] += 1
+        process = _FORK.Process(target=_child, args=(name, self._starts[name], task), name=name, daemon=False)
         process.start()
         self._children[name] = process
         self._started_at[name] = time.monotonic()
@@ -329,10 +332,14 @@ def _terminated(parent: int) -> Callable[[], bool]:
     return lambda: asked.is_set() or os.getppid() != parent
 
 
-def _child(task: Callable[[], None]) -> None:
+def _child(name: str, starts: int, task: Callable[[], None]) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # until the task has its own; the parent's stops the parent
     for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole group; the parent ends the children
         signal.signal(number, signal.SIG_IGN)
     try:
+        from rosbridge_eth import metrics
+
+        metrics.STARTS.labels(name).set(starts)
         task()
     except BridgeError as error:
         log.error("%s", error)

@@ -26,7 +26,7 @@ from rosbridge_eth.cli.terminal import (
     utc_now,
 )
 from rosbridge_eth.config import load_server_config
-from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
+from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import OperatorHome, ReaderHome
 from rosbridge_eth.identity import Role, load_ca
 from rosbridge_eth.logs import LogFormat, log_to_stderr
@@ -130,20 +130,20 @@ def chain(
     eth: Annotated[int, typer.Option(min=1, help="ETH on the operator's account.")] = 1000,
 ) -> None:
     """Start a local anvil whose chain is kept in the home, and give the operator's account ETH on it."""
-    from rosbridge_eth.administration import operator_account
     from rosbridge_eth.ledger.nodes import Anvil
 
-    place = OperatorHome(home).require()
-    account = operator_account(place)
-    with Anvil.start(port, state=home / "chain", block_time=block_time) as anvil:
-        anvil.fund(account, eth)
-        talk(f"A local chain answers at {anvil.url}; {account} has {eth} ETH. Ctrl-C ends it and keeps the chain.")
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.default_int_handler)
-        try:
+    log_to_stderr()
+    account = OperatorHome(home).require().account
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    try:
+        with Anvil.start(port, state=home / "chain.json", block_time=block_time) as anvil:
+            anvil.fund(account, eth)
+            talk(f"A local chain answers at {anvil.url}; {account} has {eth} ETH. Ctrl-C ends it and keeps the chain.")
             anvil.wait()
-        except KeyboardInterrupt:
-            talk("The chain is kept.")
+            raise ChainError("the local chain ended by itself; start it again")
+    except KeyboardInterrupt:
+        talk("The chain is kept.")
 
 
 def deploy(
@@ -384,5 +384,5 @@ def check(
         where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
         said = "" if found.proven is None else f"; the contract says {str(found.proven).lower()}"
         typer.echo(f"{found.state}{where}{said}")
-    if found.state == "unknown" or found.proven is False:
-        raise VerificationError(f"chunk {number} of stream {stream} of {robot} is not where it should be; ask again")
+    if found.state in ("unknown", "dead letter") or found.proven is False:
+        raise VerificationError(f"chunk {number} of stream {stream} of {robot} is not where it should be")

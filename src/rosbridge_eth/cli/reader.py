@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -90,7 +89,7 @@ def read(
         if trajectory is not None:
             sinks.append(trajectory.write)
         if not sinks and not json:
-            sinks.append(lambda record: sys.stdout.write(outputs.json_line(record)) and None)
+            sinks.append(lambda record: print(outputs.json_line(record), end=""))
         for record in choice.choose(_noting(reading.records(), topics)):
             chosen += 1
             for sink in sinks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
@@ -96,7 +97,7 @@ def robot(
     def on_turn() -> None:
         if beats.due():
             notify("WATCHDOG=1")
-            metrics.show_robot(running)
+            metrics.show_robot(end.robot, running, time.time())
 
     with ExitStack() as stack:
         if settings.monitor is not None:
