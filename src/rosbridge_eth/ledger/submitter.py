@@ -6,9 +6,10 @@ what is there, so nothing can be written twice or out of order, whatever is sent
 not to waste gas on. What is in flight is kept in memory only; after a restart it is waited for.
 
     the tail is no row (the inbox was lost, or put back   read the batches back from the last one, until it is known
-    from an old copy), or a row does not follow the one   which rows are on the chain; those go, the tail stands in
-    in front and the inbox does not know all that was     front of the others, and heads are raised, so that a
-    ever written                                          robot which sends them again is told they are known
+    from an old copy), or a row does not follow the one   which rows are on the chain; those go, the last confirmed
+    in front and the inbox does not know all that was     chunk and what is behind it on the chain stand in front of
+    ever written                                          the others; heads are raised, so that a robot which sends
+                                                          them again is told they are known
     the pool has fewer transactions than are in flight    the missing ones again, at the same price
     the pool has more: a restart, somebody else           wait 30 s, then send over them
     nothing moved for 30 s                                all in flight again, an eighth dearer or at today's price
@@ -88,17 +89,21 @@ class Batch(NamedTuple):
 
 @dataclass(slots=True)
 class Walk:
-    """A reading of a robot's batches back from the last one."""
+    """A reading of a robot's batches back from the last one. final: the block from which on all is confirmed."""
 
     events: Iterator[DataEvent]
-    last: bytes = b""  # the chunk it began with
+    final: int
+    newest: list[bytes] = field(default_factory=list)  # chunks that are not confirmed and the one in front of them
+    reached: bool = False  # whether that one was read
     on_chain: set[bytes] = field(default_factory=set)
     heads: dict[bytes, Head] = field(default_factory=dict)
     lowest: dict[bytes, int] = field(default_factory=dict)
 
     def add(self, event: DataEvent) -> None:
         for encoded in reversed(event.chunks):
-            self.last = self.last or encoded
+            if not self.reached:
+                self.newest.append(encoded)
+                self.reached = event.block <= self.final
             try:
                 header = Chunk.parse(encoded).header
             except Malformed:
@@ -107,8 +112,10 @@ class Walk:
             self.heads.setdefault(header.stream, Head(header.number, header.digest))
             self.lowest[header.stream] = header.number
 
-    def settles(self, header: Header) -> bool:
+    def settles(self, header: Header | None) -> bool:
         """Whether it is known by now if this chunk is on the chain, where chunks stand in the order of the log."""
+        if header is None or not self.reached:
+            return self.reached
         met = header.digest in self.on_chain or header.previous in self.on_chain
         return met or self.lowest.get(header.stream, header.number) < header.number
 
@@ -293,11 +300,12 @@ class Submitter:
         """Read back until it is known whether `oldest` is on the chain, the first of the rows in question (None: there
         are none); then make the inbox follow. Goes on in the next turn where that takes long.
         """
-        walk = account.walk = account.walk or Walk(self._ledger.newest_data(tk, standing.data_block))
+        final = (self.head.number if self.head else 0) - self._settings.confirmations + 1
+        walk = account.walk = account.walk or Walk(self._ledger.newest_data(tk, standing.data_block), final)
         try:
             for count, event in enumerate(walk.events, 1):
                 walk.add(event)
-                if oldest is None or walk.settles(oldest):
+                if walk.settles(oldest):
                     break
                 if count == WALK:
                     raise _Hold("what is on the chain is being read")
@@ -308,20 +316,27 @@ class Submitter:
             raise _Hold(f"what is on the chain cannot be read: {error}") from error
         account.walk = None
         self.counts["walks"] += 1
-        if keccak(walk.last) != standing.tail:
+        if not walk.newest or keccak(walk.newest[0]) != standing.tail:
             raise _Hold("the chain changed while it was read")
         self._inbox.raise_heads(tk, walk.heads, now)  # from here on, nothing of it is taken
         after = self._inbox.find(tk, standing.tail)
-        behind = self._inbox.rows(tk, after, 2**31)
-        if after is None or any(row.digest in walk.on_chain for row in behind):
-            try:
-                self._inbox.rebase(tk, Chunk.parse(walk.last), walk.on_chain, {}, now)
-            except Malformed as error:
-                raise _Hold(f"the last chunk on the chain is another program's: {error}") from error
+        if after is None or any(row.digest in walk.on_chain for row in self._inbox.rows(tk, after, 2**31)):
+            self._follow(tk, walk, now)
             account.flights = []
-            self.counts["rebases"] += 1
         if oldest is not None and oldest.digest not in walk.on_chain:
             account.new = oldest.digest
+
+    def _follow(self, tk: bytes, walk: Walk, now: float) -> None:
+        """What is not confirmed becomes rows again, for the chain may turn back and the robot not send it any more."""
+        self.counts["rebases"] += 1
+        try:
+            newest = [Chunk.parse(encoded) for encoded in walk.newest]
+        except Malformed as error:
+            raise _Hold(f"what another program wrote is on the chain: {error}") from error
+        on_chain = walk.on_chain
+        for chunk in newest:  # each in front of the ones before
+            self._inbox.rebase(tk, chunk, on_chain, {}, now)
+            on_chain = set()
 
     # ------------------------------------------------------------------ send
 

@@ -127,7 +127,8 @@ class ModelChain:
     def reorg(self, depth: int, *, forget: bool = False) -> None:
         """Other blocks in place of the last ones, empty; what those held is in the pool again, unless forgotten."""
         self.forks += 1
-        gone, self.states = self.states[-depth:], self.states[:-depth]
+        depth = min(depth, len(self.states) - 2)
+        gone, self.states = self.states[len(self.states) - depth :], self.states[: len(self.states) - depth]
         for tx in (tx for state in gone for tx in state.transactions):
             if not forget:
                 self.pool.setdefault(tx.sender, {}).setdefault(tx.nonce, tx)
