@@ -1,57 +1,54 @@
 """`doctor`: tries everything that a home depends on, for real, and names the mend for what does not work.
 
-Each check yields findings. It changes nothing: what is not there yet is not
-made, and a port or a session that is tried is given back.
+A check is one function that yields findings. It changes nothing: what is not there yet is not made, and a port or a
+session that is tried is given back.
 """
 
 from __future__ import annotations
 
-import importlib
+import http.client
 import importlib.util
-import json
+import json as jsonlib
 import os
-import platform
-import shutil
 import socket
 import stat
-import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from rosbridge_eth import ledger
-from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed
+import typer
+
+from rosbridge_eth import identity as ids
+from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
-from rosbridge_eth.config import (
-    RobotConfig,
-    ServerConfig,
-    load_reader_config,
-    load_robot_config,
-    load_server_config,
-)
+from rosbridge_eth.chunk import Log, robot_id
+from rosbridge_eth.cli.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
+from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config.values import parse_address
+from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, NetworkError
-from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome
-from rosbridge_eth.identity import Identity, Trust, load_identity, read_certificates
-from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot import assembly as robot_assembly
-from rosbridge_eth.robot.clock import certificate_clock, clock_synchronised
-from rosbridge_eth.robot.sender import mend as mend_of
-from rosbridge_eth.server.administration import load_ca
-from rosbridge_eth.server.assembly import bound_contract, open_chain, open_inbox, open_journal
-from rosbridge_eth.sources import open_source
-from rosbridge_eth.store.peek import peek_spool
+from rosbridge_eth.status import DEAD, ask_monitor, span
 
-OLDEST_PYTHON = (3, 11)
-PACKAGES = ("pydantic", "eth_account", "web3", "rosbags", "redis", "prometheus_client", "rich", "typer")
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger import Ledger
+
+PACKAGES = ("eth_account", "prometheus_client", "pydantic", "redis", "rich", "rosbags", "typer", "web3")
 HANDSHAKE_TIME = 6.0  # seconds for a server to answer
 ATTEMPT_TIME = 2.5  # seconds for one attempt; what a server says of a refusal is known when it ends
 EXPIRY = timedelta(days=30)
-LITTLE_ROOM = 1 << 30  # bytes
-_ETH = 10**18
+LITTLE_ROOM, SOME_ROOM = 64 << 20, 1 << 30  # bytes
+WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
+OLD_HEAD, DEAD_HEAD = 3600.0, 12 * 3600.0  # seconds since the last block
+ANYWHERE = ("0.0.0.0", "::")  # noqa: S104 - what is looked for
 
 
 class Result(StrEnum):
@@ -65,36 +62,23 @@ class Result(StrEnum):
 class Finding:
     """One thing that was tried: what was found, and the mend where something is to be done."""
 
-    what: str
     result: Result
+    what: str
     found: str
     mend: str = ""
 
 
-Check = Callable[[], Iterable[Finding]]
+Findings: TypeAlias = Iterator[Finding]
+Check: TypeAlias = Callable[[Path, bytes | None], Findings]
+"""A check is given the home and, where there is one, the passphrase of its keys."""
+ok, note, broken, skipped = (partial(Finding, result) for result in Result)
 
 
-def ok(what: str, found: str) -> Finding:
-    return Finding(what, Result.OK, found)
-
-
-def note(what: str, found: str, mend: str) -> Finding:
-    return Finding(what, Result.NOTE, found, mend)
-
-
-def broken(what: str, found: str, mend: str) -> Finding:
-    return Finding(what, Result.BROKEN, found, mend)
-
-
-def skipped(what: str, why: str, mend: str) -> Finding:
-    return Finding(what, Result.SKIPPED, why, mend)
-
-
-def examine(checks: Iterable[tuple[str, Check]]) -> Iterator[Finding]:
+def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Findings:
     """Run the checks one after the other; a failure of the bridge's own is a finding, and its text has the mend."""
-    for what, check in checks:
+    for what, check in checks.items():
         try:
-            yield from check()
+            yield from check(home, secret)
         except BridgeError as error:
             # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
             parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
@@ -102,370 +86,415 @@ def examine(checks: Iterable[tuple[str, Check]]) -> Iterator[Finding]:
             yield broken(what, found + mark.strip(".;: "), mend or "correct what this names")
 
 
-def checks_of(path: Path, kind: HomeKind, passphrase: bytes | None) -> list[tuple[str, Check]]:
-    """Everything there is to try for this home."""
-    machine: list[tuple[str, Check]] = [
-        ("Python", _python),
-        ("packages", _packages),
-        ("clock", _clock),
-        ("home", lambda: _permissions(path)),
-        ("disk", lambda: _disk(path)),
-    ]
-    match kind:
-        case HomeKind.OPERATOR:
-            return machine + _operator(OperatorHome(path), passphrase)
-        case HomeKind.ROBOT:
-            return machine + _robot(RobotHome(path), passphrase)
-        case HomeKind.READER:
-            return machine + _reader(ReaderHome(path), passphrase)
+# The machine
 
 
-# ---------------------------------------------------------------------- the machine
-
-
-def _python() -> Iterator[Finding]:
-    version = platform.python_version()
-    if sys.version_info < OLDEST_PYTHON:
-        yield broken("Python", version, "install Python 3.11 or newer")
-    else:
-        yield ok("Python", version)
-
-
-def _packages() -> Iterator[Finding]:
-    absent = []
-    for name in PACKAGES:
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            absent.append(name)
+def packages(home: Path, secret: bytes | None) -> Findings:
+    absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if absent:
-        yield broken("packages", "not to be imported: " + ", ".join(absent), "pip install 'pysmcrypto[bridge]'")
+        yield broken("packages", "not installed: " + ", ".join(absent), "pip install 'pysmcrypto[bridge]'")
     else:
         yield ok("packages", "all there")
-    if importlib.util.find_spec("coincurve") is None:
-        yield note("coincurve", "absent", "pip install coincurve: signing a transaction is then ten times as fast")
 
 
-def _clock() -> Iterator[Finding]:
+def clock(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.robot import clock_synchronised
+
     now = datetime.now(UTC)
     if now.year < 2026:
         yield broken("clock", f"it says {now:%Y-%m-%d}", "set the clock; certificates are refused before their time")
     elif not clock_synchronised():
-        yield note(
-            "clock", "the kernel does not hold it to be synchronised",
-            "start systemd-timesyncd or chrony; records say of themselves that their time is not to be relied on",
-        )
+        yield note("clock", "the kernel does not hold it to be synchronised",
+                   "start systemd-timesyncd or chrony; records say that their time is not to be relied on")
     else:
         yield ok("clock", "synchronised")
 
 
-def _permissions(path: Path) -> Iterator[Finding]:
-    mode = stat.S_IMODE(path.stat().st_mode)
-    if mode & 0o022:
-        yield broken("home", f"others may write to {path} (mode {mode:04o})", f"chmod 700 {path}")
-    elif mode & 0o055:
-        yield note("home", f"others may look into {path} (mode {mode:04o})", f"chmod 700 {path}")
+def files(home: Path, secret: bytes | None) -> Findings:
+    mode = stat.S_IMODE(home.stat().st_mode)
+    if mode & 0o077:
+        result = broken if mode & 0o022 else note
+        yield result("home", f"others may {'write to' if mode & 0o022 else 'look into'} {home} (mode {mode:04o})",
+                     f"chmod 700 {home}")
+    elif not os.access(home, os.W_OK):
+        yield broken("home", f"{home} is not writable for this user", "run as the user the service runs as")
     else:
-        yield ok("home", f"{path}, its owner's alone")
-    if not os.access(path, os.W_OK):
-        yield broken("home", f"{path} is not writable for this user", "run as the user the service runs as")
-    for key in sorted(path.rglob("*.key.pem")):
+        yield ok("home", f"{home}, its owner's alone")
+    for key in sorted([*home.rglob("*.key.pem"), *home.glob("accounts.json")]):
         mode = stat.S_IMODE(key.stat().st_mode)
         if mode & 0o077:
-            yield broken(
-                "key files", f"{key} is open to others (mode {mode:04o})",
-                f"chmod 600 {key}, and if it may have been read, register anew",
-            )
+            yield broken("key files", f"{key} is open to others (mode {mode:04o})",
+                         f"chmod 600 {key}, and if it may have been read, make its keys anew")
 
 
-def _disk(path: Path) -> Iterator[Finding]:
-    free = shutil.disk_usage(path).free
-    if free < LITTLE_ROOM:
-        yield note("disk", f"{free >> 20} MiB free at {path}", "make room; records wait here while the chain is away")
+def disk(home: Path, secret: bytes | None) -> Findings:
+    found = os.statvfs(home)
+    free = found.f_bavail * found.f_frsize
+    if free < LITTLE_ROOM or (found.f_files and not found.f_favail):
+        yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home}",
+                     "make room: until there is some nothing more is taken; what was taken is safe")
+    elif free < SOME_ROOM:
+        yield note("disk", f"{free >> 20} MiB free at {home}", "make room; chunks wait here while the chain is away")
     else:
         yield ok("disk", f"{free >> 30} GiB free")
 
 
-def _receive_buffer(setting: str) -> Iterator[Finding]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        granted = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-    if sys.platform.startswith("linux"):
-        granted //= 2  # the kernel doubles what it was asked, for its own books: socket(7)
-    if granted < RECEIVE_BUFFER:
-        yield note(
-            "receive buffer", f"the kernel grants {granted >> 10} KiB of {RECEIVE_BUFFER >> 10} KiB",
-            f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER} ({setting})",
-        )
-    else:
-        yield ok("receive buffer", f"{granted >> 10} KiB")
-
-
-def _certificates(folder: Path) -> Iterator[Finding]:
-    """Are the certificates in a folder in force, and for how long?"""
+def certificates(folder: Path, renewal: str) -> Findings:
+    """Are the certificates in a folder in force, and for how long? renewal: how they are made anew."""
     now = datetime.now(UTC)
     for path in sorted(folder.glob("*.crt.pem")):
-        for certificate in read_certificates(path.read_bytes()):
-            left = certificate.not_after - now
-            if left < timedelta(0):
-                yield broken("certificates", f"{path} expired on {certificate.not_after:%Y-%m-%d}", "register anew")
-            elif certificate.not_before > now:
-                yield broken("certificates", f"{path} begins on {certificate.not_before:%Y-%m-%d}", "set the clock")
-            elif left < EXPIRY:
-                yield note("certificates", f"{path} expires in {left.days} days", "renew it: docs/operations.md")
+        for each in ids.read_certificates(path.read_bytes()):
+            mend = "make a new home, with a new CA" if path.name == "ca.crt.pem" else renewal
+            if each.not_after < now:
+                yield broken("certificates", f"{path} expired on {each.not_after:%Y-%m-%d}", mend)
+            elif each.not_before > now:
+                yield broken("certificates", f"{path} begins on {each.not_before:%Y-%m-%d}", "set the clock")
+            elif each.not_after - now < EXPIRY:
+                yield note("certificates", f"{path} expires in {(each.not_after - now).days} days", mend)
             else:
-                yield ok("certificates", f"{path.name} of {folder.name} until {certificate.not_after:%Y-%m-%d}")
+                yield ok("certificates", f"{path.name} of {folder.name} until {each.not_after:%Y-%m-%d}")
 
 
-def _head(chain: ledger.Chain) -> Iterator[Finding]:
-    head = chain.head()
-    age = max(0, int(time.time()) - head.timestamp)
-    yield ok("node", f"{chain.url} answers; block {head.number}, {age} s old, chain {chain.chain_id()}")
-
-
-# ---------------------------------------------------------------------- an operator's home
-
-
-def _operator(home: OperatorHome, passphrase: bytes | None) -> list[tuple[str, Check]]:
-    def config() -> ServerConfig:
-        return load_server_config(home.config)
-
-    return [
-        ("configuration", lambda: (ok("configuration", str(home.config)) for _ in [config()])),
-        ("certificates", lambda: (*_certificates(home.ca), *_certificates(home.server))),
-        ("passphrase", lambda: _operator_secrets(home, passphrase)),
-        ("UDP port", lambda: _port(config())),
-        ("receive buffer", lambda: _receive_buffer("net.core.rmem_max in /etc/sysctl.d")),
-        ("registry", lambda: _registry(home)),
-        ("store", lambda: _store(home, config())),
-        ("node", lambda: _node(home, config())),
-    ]
-
-
-def _operator_secrets(home: OperatorHome, passphrase: bytes | None) -> Iterator[Finding]:
-    if passphrase is None:
-        yield skipped("passphrase", "not tried", "give --passphrase-file")
+def monitor(address: Address | None, runs: bool) -> Findings:
+    """Is the port of /metrics free, or does the process that should have it answer there?"""
+    if address is None:
         return
-    load_ca(home, passphrase)
-    load_identity(home.server, passphrase)
-    Keyring.load(home.accounts, passphrase)
-    yield ok("passphrase", "opens the CA, the server's keys and the accounts")
-
-
-def _port(config: ServerConfig) -> Iterator[Finding]:
-    try:
-        for sock in server_sockets(config.listen):
-            sock.close()
-    except NetworkError as error:
-        found = str(error).partition(";")[0]
-        yield note("UDP port", found, "fine if the server runs; otherwise stop what has the port")
-        return
-    yield ok("UDP port", f"{config.listen} is free for the server")
-
-
-def _registry(home: OperatorHome) -> Iterator[Finding]:
-    registry = Registry(home.registry)
-    try:
-        names = registry.all()
-    finally:
-        registry.close()
-    yield ok("registry", f"{sum(name.revoked_at is None for name in names)} names in force")
-
-
-def _store(home: OperatorHome, config: ServerConfig) -> Iterator[Finding]:
-    if not home.deployment_file.exists():
-        yield skipped("store", "no contract is deployed yet", f"deploy --home {home.path}")
-        return
-    if config.store.url != "sqlite" or home.inbox.exists():
-        inbox = open_inbox(config, home)
+    conditions: dict[str, bool] = {}
+    with socket.socket(socket.AF_INET6 if ":" in address.host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            held = inbox.statistics(time.time())
-        finally:
-            inbox.close()
-        yield ok("inbox", f"{held.waiting + held.leased} records wait")
-        if held.dead:
-            yield note("inbox", f"{held.dead} records under identities that are taken",
-                       "two robots with one identity? docs/operations.md, dead letters")
-    if home.journal.exists():
-        journal = open_journal(home, home.deployment())
-        try:
-            dead = journal.count_dead_letters()
-        finally:
-            journal.close()
-        yield ok("journal", "opens, and is of this contract")
-        if dead:
-            yield note("journal", f"{dead} dead letters", "docs/operations.md, dead letters")
-
-
-def _node(home: OperatorHome, config: ServerConfig) -> Iterator[Finding]:
-    chain = open_chain(config)
-    try:
-        yield from _head(chain)
-        if not home.deployment_file.exists():
-            yield skipped("contract", "none is deployed yet", f"deploy --home {home.path}")
-            return
-        deployment = home.deployment()
-        bound_contract(chain, deployment)
-        yield ok("contract", f"{deployment.contract} has the code of this version")
-        yield from _balances(chain, home, config)
-    finally:
-        chain.close()
-
-
-def _balances(chain: ledger.Chain, home: OperatorHome, config: ServerConfig) -> Iterator[Finding]:
-    operator = json.loads(home.accounts.read_bytes())["operator"]
-    treasury = chain.balance(operator) / _ETH
-    if treasury < config.funds.by:
-        yield broken("treasury", f"{operator} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
-                     f"send ETH to {operator}")
+            probe.bind(tuple(address))
+            taken = False
+        except OSError as error:
+            taken, why = True, error.strerror
+    with suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError):
+        conditions = dict(jsonlib.loads(ask_monitor(address, "/readyz"))["conditions"]) if taken and runs else {}
+    failing = [name for name, holds in conditions.items() if not holds]
+    if failing:
+        yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
+    elif conditions or not (taken or runs):
+        yield ok("monitor", f"{address} " + ("says ready" if conditions else "is free"))
     else:
-        yield ok("treasury", f"{treasury:.4f} ETH")
-    registry = Registry(home.registry)
-    try:
-        robots = [robot for robot in registry.all("robot") if robot.revoked_at is None and robot.account]
-    finally:
-        registry.close()
-    low = [robot.name for robot in robots if chain.balance(robot.account or "") / _ETH < config.funds.below]
-    if low:
-        yield note("robots' accounts", f"below {config.funds.below:g} ETH: {', '.join(low)}",
-                   "the server tops them up when they write, as long as the treasury can")
-    elif robots:
-        yield ok("robots' accounts", f"{len(robots)} have enough")
+        yield broken("monitor", f"{address} is not answered by this home's process" + (f" ({why})" if taken else ""),
+                     "stop what has the port, or correct `monitor`; then start again")
 
 
-# ---------------------------------------------------------------------- a robot's home
-
-
-def _robot(home: RobotHome, password: bytes | None) -> list[tuple[str, Check]]:
-    def config() -> RobotConfig:
-        return load_robot_config(home.config)
-
-    opened: list[Identity] = []
-
-    return [
-        ("configuration", lambda: (ok("configuration", str(home.config)) for _ in [config()])),
-        ("bridge", lambda: (ok("bridge", f"{end.robot} of {end.server_name}") for end in [home.bridge()])),
-        ("certificates", lambda: _certificates(home.identity)),
-        ("readers", lambda: _readers(home, config())),
-        ("source", lambda: _source(config())),
-        ("password", lambda: _robot_secrets(home, password, opened)),
-        ("spool", lambda: _spool(home)),
-        ("server", lambda: _handshake(home, config(), opened)),
-    ]
-
-
-def _readers(home: RobotHome, config: RobotConfig) -> Iterator[Finding]:
-    roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
-    keys = robot_assembly.reader_keys(config, home, roots)
-    yield ok("readers", f"{len(keys)} can open what this robot writes")
-
-
-def _source(config: RobotConfig) -> Iterator[Finding]:
-    settings, why = config.source_and_why(os.environ)
-    if settings.kind.startswith("ros"):
-        set_up = {name: value for name, value in sorted(os.environ.items()) if name.startswith("ROS_")}
-        yield ok("ROS environment", ", ".join(f"{name}={value}" for name, value in set_up.items()) or "nothing set")
-    source = open_source(settings.settings(), config.selection())
-    try:
-        offers = source.offers()
-    finally:
-        source.close()
-    if settings.kind == "sim":
-        yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
-    elif not offers:
-        yield note("source", f"{settings.kind} answers and offers no topic", "start what publishes")
-    else:
-        yield ok("source", f"{settings.kind} ({why}) offers {len(offers)} topics")
-
-
-def _robot_secrets(home: RobotHome, password: bytes | None, opened: list[Identity]) -> Iterator[Finding]:
-    if password is None:
-        yield skipped("password", "not tried", "give --passphrase-file with the registration password")
-        return
-    identity, _ = load_identity(home.identity, password)
-    opened.append(identity)
-    yield ok("password", f"opens the keys of {identity.name}")
-
-
-def _spool(home: RobotHome) -> Iterator[Finding]:
-    if not home.spool.exists():
-        yield ok("spool", "none yet; the first start makes it")
-        return
-    held = peek_spool(home.spool)
-    if held.records is None or held.bytes is None:
-        yield ok("spool", "in use by the robot that runs")
-    else:
-        yield ok("spool", f"{held.records} records, {held.bytes >> 10} KiB wait for the server")
-
-
-def _handshake(home: RobotHome, config: RobotConfig, opened: Sequence[Identity]) -> Iterator[Finding]:
-    """A session with the server, as the robot would make it, and its end."""
-    end = home.bridge()
-    place = config.server or robot_assembly.parse_server(end.server_address)
-    if not opened:
-        yield skipped("server", f"{place} not tried", "give --passphrase-file: it takes the robot's keys to be let in")
-        return
-    if home.spool.exists() and peek_spool(home.spool).in_use:
-        yield skipped("server", f"{place} not tried: a session would end that of the robot that runs",
-                      "see its /readyz, or stop it")
-        return
-    roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
+def shake_hands(
+    place: Address, identity: ids.Identity, trust: ids.Trust, server: str, mode: str, wall: Callable[[], datetime]
+) -> tuple[list[Event], int]:
+    """Try a session, and end it: what happened, and how many datagrams came back."""
     sock, address = client_socket(place)
     events: list[Event] = []
     now = time.monotonic()
-    client = Client(
-        ClientConfig(mode=robot_assembly.MODES[config.channel], attempt_timeout=ATTEMPT_TIME), opened[0], Trust(roots),
-        end.server_name, now, wall=certificate_clock(home),
-    )
+    config = ClientConfig(mode=Mode[mode.upper()], attempt_timeout=ATTEMPT_TIME)
+    client = Client(config, identity, trust, server, now, wall=wall)
     loop = UdpLoop(client, sock, events.append)
     client.connect(address, now)
     try:
-        while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(e, Connected) for e in events):
+        while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(each, Connected) for each in events):
             loop.step(0.2)
-        took = time.monotonic() - now
         client.close(time.monotonic())
         loop.step(0.0)
     finally:
         loop.close()
-    if any(isinstance(event, Connected) for event in events):
-        yield ok("server", f"{place} made a session in {took * 1000:.0f} ms")
+    return events, client.statistics().datagrams_received
+
+
+def chain(ledger: Ledger) -> Findings:
+    """The node answers, has our contract, and its time is ours."""
+    head = ledger.block()
+    age = time.time() - head.time
+    yield ok("node", f"{ledger.url} answers; block {head.number}, {span(max(0.0, age))} old")
+    ledger.check()
+    yield ok("contract", f"{ledger.contract} on chain {ledger.chain_id} has the code of this version")
+    if age < -WRONG_CLOCK:
+        yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
+    elif age > OLD_HEAD:
+        result = broken if age > DEAD_HEAD else note
+        yield result(
+            "clock", f"by it, the last block is {span(age)} old",
+            "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain makes the"
+            " next one with the next transaction)",
+        )
+
+
+# An operator's home
+
+
+def operator_configuration(home: Path, secret: bytes | None) -> Findings:
+    config = load_server_config(OperatorHome(home).config)
+    yield ok("configuration", str(OperatorHome(home).config))
+    robots = str(config.address_for_robots())
+    for bundle in sorted(OperatorHome(home).bundles.glob("*.bundle")):
+        told = jsonlib.loads(bundle.read_bytes()).get("end", {}).get("server_address", robots)  # {}: a sealed one
+        if told != robots:
+            result = broken if parse_address(told).host in ANYWHERE else note
+            yield result("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
+                         f'write server = "{robots}" into the robot.toml of who joined with it')
+
+
+def operator_certificates(home: Path, secret: bytes | None) -> Findings:
+    yield from certificates(OperatorHome(home).ca, "")
+    yield from certificates(OperatorHome(home).server, f"run `renew --home {home}`, then start the server again")
+
+
+def operator_passphrase(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Keyring
+
+    if secret is None:
+        yield skipped("passphrase", "not tried", "give --passphrase-file")
         return
-    failures = [e for e in events if isinstance(e, HandshakeFailed)] or [HandshakeFailed("no answer")]
+    ids.load_identity(OperatorHome(home).server, secret)
+    Keyring.load(OperatorHome(home).accounts, secret)
+    yield ok("passphrase", "opens the server's keys and the accounts")
+
+
+def door(home: Path, secret: bytes | None) -> Findings:
+    """The robots' UDP port is free, or a server answers there; the same of the monitor's."""
+    config = load_server_config(OperatorHome(home).config)
+    try:
+        for sock in server_sockets(config.listen):
+            sock.close()
+        answers = 0
+        yield ok("UDP port", f"{config.listen} is free: the server does not run")
+    except NetworkError as error:
+        now = datetime.now(UTC)
+        ca = ids.create_ca("doctor", at=now)  # who is not let in is refused, but by a server
+        nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
+        near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listen.host, config.listen.host)  # noqa: S104
+        place = config.listen._replace(host=near)
+        _, answers = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
+        if answers:
+            yield ok("UDP port", f"a server answers at {place}")
+        else:
+            yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
+                         f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
+    yield from monitor(config.monitor, answers > 0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        granted = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel doubles it: socket(7)
+    if granted < RECEIVE_BUFFER:
+        yield note("receive buffer", f"the kernel grants {granted >> 10} KiB of {RECEIVE_BUFFER >> 10} KiB",
+                   f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER}, and in /etc/sysctl.d")
+
+
+def registry(home: Path, secret: bytes | None) -> Findings:
+    with Registry(OperatorHome(home).registry) as opened:
+        yield ok("registry", f"{sum(name.revoked_at is None for name in opened.all())} names in force")
+
+
+def store(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.supervisor import open_store
+
+    place = OperatorHome(home)
+    if not place.deployment_file.exists():
+        yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home}`")
+        return
+    try:
+        inbox = open_store(load_server_config(place.config), place, read_only=True)
+    except NothingThere:
+        yield ok("store", "there is none yet; the server makes it")
+        return
+    with closing(inbox), Registry(place.registry) as opened:
+        inbox.check()
+        names, held = opened.names(), inbox.totals()
+        yield ok("store", f"{sum(waiting.chunks for waiting in held.values())} chunks wait")
+        for tk in held:
+            if hold := inbox.state(tk).hold:
+                yield note("on hold", f"{names.get(tk, tk.hex())}: {hold}", "docs/operations.md, On hold")
+        if dead := inbox.dead(DEAD):
+            yield note("dead letters", f"{len(dead)}, the last: {dead[0].why}", "docs/operations.md, Dead letters")
+
+
+def operator_node(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.ledger.contract import WEI_PER_ETH
+
+    place = OperatorHome(home)
+    config = load_server_config(place.config)
+    with closing(Ledger.connect(config.chain.url, place.deployment())) as ledger, Registry(place.registry) as opened:
+        yield from chain(ledger)
+        if ledger.operator() != place.account:
+            yield broken("operator", f"the contract's operator is {ledger.operator()}, this home's {place.account}",
+                         "use the home of that account, or let it offer and this one accept the role")
+        treasury = ledger.balance(place.account) / WEI_PER_ETH
+        if treasury < config.funds.by:
+            yield broken("treasury", f"{place.account} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
+                         f"send ETH to {place.account}")
+        else:
+            yield ok("treasury", f"{treasury:.4f} ETH")
+        robots = {tk: robot for tk, robot in opened.robots().items() if robot.revoked_at is None}
+        for robot, standing in zip(robots.values(), ledger.standings([*robots]), strict=True):
+            if standing.certificates_hash != robot.hash or standing.revoked:
+                yield broken("registration", f"the contract has {robot.name} with other certificates, or revoked",
+                             f"run `register {robot.name} REQUEST --replace`, or restore a newer registry.sqlite")
+            elif standing.balance < config.funds.below * WEI_PER_ETH:
+                yield note("accounts", f"{robot.name} has {standing.balance / WEI_PER_ETH:.4f} ETH",
+                           "the server tops it up when it writes, as long as the treasury can")
+
+
+# A robot's home
+
+
+def bridge(home: Path, secret: bytes | None) -> Findings:
+    end, config = RobotHome(home).bridge(), load_robot_config(RobotHome(home).config)
+    yield ok("configuration", str(RobotHome(home).config))
+    place = config.server or parse_address(end.server_address)
+    if place.host in ANYWHERE or place.port == 0:
+        yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
+                     'write server = "HOST:PORT", as the server is reached, into robot.toml')
+    else:
+        yield ok("bridge", f"{end.robot} sends to {end.server_name} at {place}")
+
+
+def robot_certificates(home: Path, secret: bytes | None) -> Findings:
+    name, place = RobotHome(home).bridge().robot, RobotHome(home)
+    mend = f"let the operator run `register {name} REQUEST --replace` with {place.request.name}, and join again"
+    yield from certificates(place.identity, mend)
+
+
+def readers(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.robot import reader_keys
+
+    place = RobotHome(home)
+    roots = ids.read_certificates((place.identity / "ca.crt.pem").read_bytes())
+    yield ok("readers", f"{len(reader_keys(load_robot_config(place.config), place, roots))} can open what it writes")
+
+
+def source(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.sources import open_source
+
+    config = load_robot_config(RobotHome(home).config)
+    settings, why = config.source_and_why(os.environ)
+    with closing(open_source(settings.settings(), config.selection())) as opened:
+        offers = opened.offers()
+    if settings.kind == "sim":
+        yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
+    elif not offers:
+        yield note("source", f"{settings.kind} ({why}) answers and offers no topic", "start what publishes")
+    else:
+        yield ok("source", f"{settings.kind} ({why}) offers {len(offers)} topics")
+
+
+def session(home: Path, secret: bytes | None) -> Findings:
+    """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
+    from rosbridge_eth.robot import certificate_clock
+    from rosbridge_eth.sender import mend
+    from rosbridge_eth.spool import Spool
+
+    place, runs = RobotHome(home), False
+    end, config = place.bridge(), load_robot_config(place.config)
+    log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
+    try:
+        Spool(place.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
+        yield ok("spool", "opens")
+    except NothingThere:
+        yield ok("spool", "none yet; the first start makes it")
+    except InUse:
+        runs = True
+        yield ok("spool", "in use by the robot that runs")
+    yield from monitor(config.monitor, runs)
+    if secret is None or runs:
+        why = "a session would end that of the robot that runs" if runs else "it takes the robot's keys to be let in"
+        yield skipped("server", f"{server} not tried: {why}", "see its /readyz" if runs else "give --passphrase-file")
+        return
+    identity, roots = ids.load_identity(place.identity, secret)
+    yield ok("password", f"opens the keys of {identity.name}")
+    trust, wall = ids.Trust(roots), certificate_clock(place)
+    events, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
+    for event in events:
+        if isinstance(event, Connected):
+            yield ok("server", f"{server} made a session")
+            off = 0.0 if event.server_time is None else time.time() - event.server_time.timestamp()
+            if abs(off) > WRONG_CLOCK:
+                yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
+                             "set the one of the two that is wrong")
+            return
+    failures = [event for event in events if isinstance(event, HandshakeFailed)] or [HandshakeFailed("no answer")]
     # One attempt may have lost what another was told.
     failure = next((event for event in reversed(failures) if event.hint is not None), failures[-1])
-    if client.statistics().datagrams_received == 0:
-        mend = (
-            f"is the server up, its `public` address right, UDP port {place.port} open in every firewall between, and"
-            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
-        )
+    silent = (
+        f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
+        f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
+    )
+    yield broken("server", f"{server}: {failure.why}", mend(failure, config.channel) if answers else silent)
+
+
+# A reader's folder
+
+
+def reader_keys(home: Path, secret: bytes | None) -> Findings:
+    folder = load_reader_config(ReaderHome(home).config).identity
+    yield from certificates(folder, "let the operator make this reader anew (`reader NAME --replace`)")
+    if secret is None:
+        yield skipped("passphrase", "not tried", "give --passphrase-file")
     else:
-        mend = mend_of(failure, config.channel)
-    yield broken("server", f"{place}: {failure.why}", mend)
-
-
-# ---------------------------------------------------------------------- a reader's folder
-
-
-def _reader(home: ReaderHome, passphrase: bytes | None) -> list[tuple[str, Check]]:
-    def node() -> Iterator[Finding]:
-        config = load_reader_config(home.config)
-        chain = ledger.connect(config.chain)
-        try:
-            yield from _head(chain)
-            ledger.Contract.at(chain, config.contract)
-            yield ok("contract", f"{config.contract} has the code of this version")
-        finally:
-            chain.close()
-
-    def secrets() -> Iterator[Finding]:
-        if passphrase is None:
-            yield skipped("passphrase", "not tried", "give --passphrase-file")
-            return
-        identity, _ = load_identity(load_reader_config(home.config).identity, passphrase)
+        identity, _ = ids.load_identity(folder, secret)
         yield ok("passphrase", f"opens the keys of {identity.name}")
 
-    return [
-        ("certificates", lambda: _certificates(load_reader_config(home.config).identity)),
-        ("passphrase", secrets),
-        ("node", node),
-    ]
+
+def reader_nodes(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Ledger
+
+    config = load_reader_config(ReaderHome(home).config)
+    for url in config.chain:
+        with closing(Ledger.connect(url, config)) as ledger:
+            ask = partial(chain, ledger)
+            yield from examine({"node": lambda home, secret, ask=ask: ask()}, home, secret)  # type: ignore[misc]
+
+
+_MACHINE: dict[str, Check] = {"packages": packages, "clock": clock, "home": files, "disk": disk}
+CHECKS: dict[HomeKind, dict[str, Check]] = {
+    HomeKind.OPERATOR: _MACHINE | {
+        "configuration": operator_configuration, "certificates": operator_certificates,
+        "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
+        "node": operator_node,
+    },
+    HomeKind.ROBOT: _MACHINE | {
+        "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
+        "server": session,
+    },
+    HomeKind.READER: _MACHINE | {"keys": reader_keys, "node": reader_nodes},
+}  # fmt: skip
+
+
+# The command
+
+_SIGN = {Result.OK: "ok", Result.NOTE: "NOTE", Result.BROKEN: "BROKEN", Result.SKIPPED: "not tried"}
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth doctor --home robot --passphrase-file password")(doctor)
+
+
+def doctor(
+    home: AnyHomeOption = OPERATOR_HOME,
+    passphrase: Annotated[
+        Path | None, typer.Option("--passphrase-file", help="Of this home's keys (a robot's password), to try them."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Try everything this home depends on, and name the mend for what does not work. An operator's, robot's, reader's.
+
+    Exits with 1 if something is broken.
+    """
+    kind = kind_of(home)
+    file = passphrase or passphrase_file(kind)
+    if file is None and kind is HomeKind.OPERATOR:
+        with suppress(BridgeError):  # a configuration that cannot be read is a finding, and told below
+            file = load_server_config(OperatorHome(home).config).passphrase_file
+    secret = None if file is None else read_passphrase(kind, "", file=file)
+    findings = []
+    for finding in examine(CHECKS[kind], home, secret):
+        findings.append(finding)
+        if not json and finding.result is not Result.OK:
+            talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}. {finding.mend}")
+    count = sum(finding.result is Result.BROKEN for finding in findings)
+    if json:
+        found = [{"what": f.what, "result": f.result, "found": f.found, "mend": f.mend} for f in findings]
+        print_json({"home": str(home), "kind": kind, "broken": count, "findings": found})
+    else:
+        rows = [(f.what, _SIGN[f.result], f.found) for f in findings]
+        data.print(table(f"The {kind}'s home {home}", ["what", "result", "found"], rows))
+    if count:
+        raise BridgeError(f"{count} things are broken; each line above names the mend")
