@@ -769,7 +769,7 @@ def clock_jumps(site: Site, seed: int) -> Count:
 
 def revoked(site: Site, seed: int) -> Count:
     """The robot is revoked while it sends: its session ends, what it handed over is written, the rest has a name."""
-    flow = Flow(site, "robot revoked", seed, pace=1)  # it would go on for 10 s
+    flow = Flow(site, "robot revoked", seed, pace=0.2)  # it would go on for 50 s
     program = flow.start()
     flow.pause(0.3, 0.9)
     site.revoke(flow.name)
