@@ -1,4 +1,4 @@
-"""SQLite files that chunks depend on: durable, private, checked when they are opened, usable on a full disk.
+"""SQLite files that chunks depend on: durable, private, refused where they are damaged, usable on a full disk.
 
 WAL mode, one fsync a commit: what was committed survives the loss of power. A page that the log (FILE-wal) adds
 to the file needs room on the disk a second time, when it is copied there, and as long as it cannot be copied
@@ -92,7 +92,7 @@ class Database:
 
     def _open(self, application: int, schema: str, read_only: bool) -> None:
         with self.errors(opening=True):
-            if self._exclusive:
+            if self._exclusive and not read_only:
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")  # and no -shm file, which would need room
             self._db.execute("PRAGMA temp_store = MEMORY")
             found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]
@@ -115,9 +115,18 @@ class Database:
             if not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA wal_autocheckpoint = {self._wal_pages}")
-            health = self.one("PRAGMA quick_check(1)")[0]
-            if health != "ok":
-                raise sqlite3.DatabaseError(health)
+            if self._exclusive:
+                self._check()
+
+    def check(self) -> None:
+        """StoreError if the file is damaged; reads all of it."""
+        with self.errors(opening=True):
+            self._check()
+
+    def _check(self) -> None:
+        health = self.one("PRAGMA quick_check(1)")[0]
+        if health != "ok":
+            raise sqlite3.DatabaseError(health)
 
     def replaced(self) -> bool:
         """Whether the path leads to another file by now, or to none."""

@@ -100,7 +100,7 @@ class Spool:
                 make = "INSERT INTO spool SELECT ?, ?, ?, 0, 0, 0 WHERE NOT EXISTS (SELECT 1 FROM spool)"
                 self._db.write(lambda: self._db.run(make, (*log, bytes(32))))
             with self._db.errors():
-                row = self._db.one("SELECT ledger, tk, last FROM spool")
+                row = self._db.one("SELECT ledger, tk, last FROM spool") or (*log, bytes(32))
             if row[:2] != log:
                 raise StoreError(
                     f"the spool {path} is another robot's, or for another contract; what it holds is signed for that"
@@ -127,8 +127,7 @@ class Spool:
         self.last_digest = chunk.header.digest
 
     def _append(self, chunk: Chunk, size: int, *, spare: int) -> None:
-        held = self._bytes()
-        self._shrink(min(self._max_bytes - size, held - spare))
+        self._shrink(min(self._max_bytes - size, self._bytes() - spare))
         self._insert(None, chunk)
         self._db.run("UPDATE spool SET last = ?", (chunk.header.digest,))
 
@@ -224,7 +223,7 @@ class Spool:
         """What is in the spool at this moment."""
         with self._db.errors():
             held = {row[0]: row[1:] for row in self._db.run("SELECT * FROM held")}
-            dropped = self._db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool")
+            dropped = self._db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool") or (0, 0, 0)
         chunks, records, size = map(sum, zip(*held.values(), strict=True))
         return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
 

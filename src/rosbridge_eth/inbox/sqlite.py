@@ -10,7 +10,7 @@ from typing import Any, Final
 from eth_utils.crypto import keccak
 
 from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.database import Database
+from rosbridge_eth.database import Database, NothingThere
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import DEAD_LETTERS, DeadLetter, Head, Inbox, InboxExchanged, Outcome, Row, Waiting
 
@@ -60,7 +60,10 @@ class SqliteInbox(Inbox):
             if not self._read_only:
                 make = "INSERT INTO inbox SELECT ?, ? WHERE NOT EXISTS (SELECT 1 FROM inbox)"
                 self._db.write(lambda: self._db.run(make, (secrets.token_bytes(16), self._ledger)))
-            ((self.id, ledger),) = self._read("SELECT id, ledger FROM inbox")
+            rows = self._read("SELECT id, ledger FROM inbox")
+            if not rows:
+                raise NothingThere(f"there is no inbox {self._path} yet")
+            self.id, ledger = rows[0]
             if ledger != self._ledger:
                 raise StoreError(f"the inbox {self._path} is for another contract or chain; move it away")
         except BaseException:
@@ -71,7 +74,7 @@ class SqliteInbox(Inbox):
         self._db.close()
 
     def check(self) -> None:
-        """A file that could be opened keeps what is committed."""
+        self._db.check()
 
     def _read(self, statement: str, *values: Any) -> list[Any]:
         with self._db.errors():

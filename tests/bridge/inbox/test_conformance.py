@@ -427,6 +427,11 @@ def test_a_look_makes_nothing_and_changes_nothing(backend):
     assert looking.head(A, STREAM) is not None
     looking.close()
     assert backend.copy() == before
+    writing, looking = backend.open(), backend.open(read_only=True)
+    put(writing, [chunk(7)])
+    assert len(rows(looking)) == 4
+    looking.close()
+    writing.close()
 
 
 def test_the_inbox_of_another_contract_is_refused_or_apart(backend):
@@ -729,5 +734,5 @@ class Model(RuleBasedStateMachine):
 def test_any_sequence_of_calls_agrees_with_plain_lists(backend):
     run_state_machine_as_test(
         lambda: Model(backend),
-        settings=settings(stateful_step_count=25, suppress_health_check=[HealthCheck.too_slow]),
+        settings=settings(stateful_step_count=15, suppress_health_check=[HealthCheck.too_slow]),
     )

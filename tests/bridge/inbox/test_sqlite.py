@@ -69,10 +69,13 @@ def test_damage_is_told_with_the_way_out_and_the_file_is_left_where_others_may_h
     inbox.append([(A, one) for one in chain(50)], 1.0)
     inbox.close()
     data = bytearray(path.read_bytes())
-    data[4096:-4096] = bytes(len(data) - 8192)
+    middle = len(data) // 2
+    data[middle : middle + 8192] = bytes(8192)
     path.write_bytes(data)
+    inbox = open_file(path)
     with pytest.raises(StoreError, match=r"damaged.*stop what uses it, move it.*\.recover"):
-        open_file(path)
+        inbox.check()
+    inbox.close()
     assert path.read_bytes() == data
 
 

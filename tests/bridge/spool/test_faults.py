@@ -198,7 +198,11 @@ def test_a_crash_on_a_full_disk_leaves_what_was_there(disk, tmp_path):
     found = all_of(spool)
     shutil.copytree(disk, tmp_path / "as the crash left it")
     spool.close()
-    again = open_spool(tmp_path / "as the crash left it" / "spool.sqlite")
+    crashed = tmp_path / "as the crash left it" / "spool.sqlite"
+    looking = Spool(crashed, LOG, max_bytes=PLENTY, drop=dropped, read_only=True)
+    assert all_of(looking) == found
+    looking.close()
+    again = open_spool(crashed)
     assert all_of(again) == found
     assert again.last_digest == found[-1].header.digest
     again.close()
