@@ -1,17 +1,15 @@
-"""What a message, a handshake and a stranger cost at each end of the channel. No sockets: bytes in, bytes out.
+"""What chunks, a handshake and a stranger cost at each end of the channel, and how fast it carries.
 
-Run: PYTHONPATH=src python benchmarks/bench_channel.py
+Run: PYTHONPATH=src python benchmarks/bench_channel.py [--link]
 
-A message is one record of 256 or 512 sealed bytes with its 25 bytes of
-request. "robot" is all it does for a message: queueing, packing, sealing,
-opening and working through the server's answers. "server" is receiving,
-opening, delivering, answering, sealing the answers. Beside them stands what
-AES-GCM of OpenSSL, by `cryptography`, would take for the same packets' cipher
-alone, in the same run: the share of the cost that is Python's and the channel's.
+Without sockets: bytes in, bytes out, the processor's time of the two ends apart. Through loopback: two processes and
+their sockets. Beside the cipher stands AES-GCM of OpenSSL, by `cryptography`, in the same run. --link adds the rates
+through simulated links with loss (minutes).
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import statistics
@@ -19,27 +17,31 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.channel import Client, ClientConfig, MessageReceived, Mode, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.wire import Hello
+from rosbridge_eth.channel import Client, ClientConfig, Connected, Message, Mode, Server, ServerConfig, cookie_key
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.wire import SEGMENT_SIZE, Hello
 from smcrypto import sm3, sm4
 
 HERE, THERE = ("192.0.2.7", 50000), ("192.0.2.1", 4433)
+CHUNK = 8_600  # bytes: 100 records of the sample's Odometry
 AT = datetime.now(UTC) - timedelta(hours=1)
 CA = ids.create_ca("bench", at=AT)
 HUB = ids.enrol(CA, ids.Role.SERVER, "hub", at=AT)
+ROBOT = ids.enrol(CA, ids.Role.ROBOT, "robot_1", at=AT)
 TRUST = ids.Trust((CA.certificate,))
-clock = time.perf_counter
+clock = time.process_time
 
 
-def robot(name: str = "robot_1") -> ids.Identity:
-    return ids.enrol(CA, ids.Role.ROBOT, name, at=AT)
-
-
-def make_server(mode: Mode = Mode.EXCHANGE) -> Server:
+def make_server(now: float = 0.0, mode: Mode = Mode.EXCHANGE) -> Server:
     config = ServerConfig(modes=(mode,), source_rate=1e9, source_burst=1e9, handshake_share=1e9)
-    return Server(config, HUB, TRUST, cookie_key(HUB), 0.0)
+    return Server(config, HUB, TRUST, cookie_key(HUB), now)
+
+
+def make_client(now: float = 0.0, mode: Mode = Mode.EXCHANGE) -> Client:
+    return Client(ClientConfig(mode=mode), ROBOT, TRUST, "hub", now)
 
 
 def handshake(server: Server, client: Client, now: float) -> tuple[float, float]:
@@ -66,53 +68,90 @@ def handshake(server: Server, client: Client, now: float) -> tuple[float, float]
     return spent[0], spent[1]
 
 
-def messages(size: int, batch: int, rounds: int) -> tuple[float, float, float, float]:
-    """Microseconds per message: robot sending, robot receiving, server receiving, server answering."""
-    server, client = make_server(), Client(ClientConfig(), robot(), TRUST, "hub", 0.0)
+def carried(size: int, count: int) -> tuple[float, float]:
+    """Microseconds per message at the robot and at the server, answered by 41 bytes each (a Stored)."""
+    server, client = make_server(), make_client()
     handshake(server, client, 0.0)
-    payload = os.urandom(size)
-    samples: list[tuple[float, float, float, float]] = []
-    now = 0.0
-    for _ in range(rounds):
-        now += 0.05  # a pause in which pacing lets everything go
+    payload, answer = os.urandom(size), bytes(41)
+    robot = hub = now = 0.0
+    sent = got = answered = 0
+    while answered < count:
+        now += 0.005
         began = clock()
-        for _ in range(batch):
+        client.handle_timer(now)
+        while sent < count and client.writable(now, size):
             client.send(payload)
-        sent = client.datagrams_to_send(now)
-        robot_send = clock() - began
-        now += 0.001
+            sent += 1
+        up = client.datagrams_to_send(now)
+        robot += clock() - began
         began = clock()
-        for data, _ in sent:
+        server.handle_timer(now)
+        for data, _ in up:
             server.receive_datagram(data, HERE, now)
-        heard = []
         while (event := server.next_event()) is not None:
-            heard.append(event)
-        server_receive = clock() - began
+            if isinstance(event, Message):
+                got += 1
+                server.send(event.connection, answer)
+        down = server.datagrams_to_send(now)
+        hub += clock() - began
         began = clock()
-        for event in heard:
-            if isinstance(event, MessageReceived):
-                server.reply(event.connection, event.message_id, b"\0")
-        sent = server.datagrams_to_send(now)
-        server_answer = clock() - began
-        began = clock()
-        for data, _ in sent:
+        for data, _ in down:
             client.receive_datagram(data, THERE, now)
-        answered = 0
-        while client.next_event() is not None:
-            answered += 1
-        robot_receive = clock() - began
-        if answered == batch:
-            samples.append((robot_send, robot_receive, server_receive, server_answer))
-        now += 0.03
-        for data, _ in client.datagrams_to_send(now):  # the acknowledgement of the answers, when it is due
-            server.receive_datagram(data, HERE, now)
-        server.datagrams_to_send(now)
-        while client.next_event() is not None:
-            pass
-    if len(samples) < rounds // 2:
-        raise RuntimeError(f"only {len(samples)} of {rounds} rounds went through: {client.statistics()}")
-    medians = [statistics.median(column) / batch * 1e6 for column in zip(*samples, strict=True)]
-    return medians[0], medians[1], medians[2], medians[3]
+        while (event := client.next_event()) is not None:
+            answered += isinstance(event, Message)
+        robot += clock() - began
+    return robot / count * 1e6, hub / count * 1e6
+
+
+def loopback(megabytes: float) -> None:
+    """Two processes, one socket each."""
+    count = int(megabytes * 1e6 / CHUNK)
+    [listening] = server_sockets(("127.0.0.1", 0))
+    sock, address = client_socket(listening.getsockname()[:2])
+    server, client = make_server(time.monotonic()), make_client(time.monotonic())
+    child = os.fork()
+    if child == 0:
+        loop = UdpLoop(
+            server,
+            listening,
+            lambda event: server.send(event.connection, bytes(41)) if isinstance(event, Message) else None,
+        )
+        while not client_gone(server):
+            loop.step(0.5)
+        spent = time.process_time()
+        print(f"  the server's process worked          {spent:8.2f} s, {megabytes / spent:5.2f} MB/s of its time")
+        sys.stdout.flush()
+        os._exit(0)
+    answered = 0
+
+    def on_event(event: object) -> None:
+        nonlocal answered
+        answered += isinstance(event, Message)
+
+    loop = UdpLoop(client, sock, on_event)
+    client.connect(address, time.monotonic())
+    while client.state != "connected":
+        loop.step(1.0)
+    payload, sent = os.urandom(CHUNK), 0
+    began, worked = time.perf_counter(), time.process_time()
+    while answered < count:
+        while sent < count and client.writable(time.monotonic(), CHUNK):
+            client.send(payload)
+            sent += 1
+        loop.step(0.5)
+    took, worked = time.perf_counter() - began, time.process_time() - worked
+    counted = client.statistics()
+    client.close(time.monotonic())
+    loop.close()
+    os.waitpid(child, 0)
+    print(f"  the robot's process worked           {worked:8.2f} s, {megabytes / worked:5.2f} MB/s of its time")
+    print(f"  {count} chunks, each answered, took {took:10.2f} s, {megabytes / took:5.2f} MB/s, "
+          f"{counted.packets_lost} packets lost")
+
+
+def client_gone(server: Server) -> bool:
+    counted = server.statistics()
+    return counted.handshakes > 0 and counted.connections == 0
 
 
 def each(call: Callable[[], object], count: int) -> float:
@@ -125,42 +164,23 @@ def each(call: Callable[[], object], count: int) -> float:
     return statistics.median(times) * 1e6
 
 
-def main() -> None:
-    print(f"{platform.python_implementation()} {platform.python_version()} on {platform.machine()}, "
-          f"{os.cpu_count()} cores; SM3: {sm3.ENGINE}")
-    gcm, key = sm4.SM4GCM(os.urandom(16)), os.urandom(16)
-    nonce, header = bytes(12), bytes(15)
-    print("\ncipher of one packet, µs        100 B   600 B  1150 B")
-    sizes = (100, 600, 1150)
+def ciphers() -> None:
+    gcm, key, nonce, header = sm4.SM4GCM(os.urandom(16)), os.urandom(16), bytes(12), bytes(13)
+    sizes = (100, 600, SEGMENT_SIZE)
+    print("\ncipher of one packet, µs        100 B   600 B  1166 B")
     print("  SM4-GCM, smcrypto          " + "".join(
         f"{each(lambda s=s: gcm.encrypt(nonce, bytes(s), header), 300):8.1f}" for s in sizes))
     try:
         from cryptography.hazmat.primitives.ciphers.aead import AESGCM
     except ImportError:
         print("  (cryptography is not installed: no peer)", file=sys.stderr)
-    else:
-        aes = AESGCM(key)
-        print("  AES-GCM, OpenSSL           " + "".join(
-            f"{each(lambda s=s: aes.encrypt(nonce, bytes(s), header), 300):8.1f}" for s in sizes))
-    print("\nper message, µs       robot sends  robot hears  server hears  server answers")
-    for size in (256 + 25, 512 + 25):
-        for batch in (1, 4, 32):
-            row = messages(size, batch, 200 if batch < 32 else 60)
-            print(f"  {size:4d} B, {batch:2d} at once" + "".join(f"{value:13.1f}" for value in row))
-    print("\nhandshake, ms             server      client")
-    for mode in Mode:
-        for label, count in (("first", 1), ("again", 10)):
-            who = [robot(f"robot_{i}") for i in range(8)]
-            server = make_server(mode)
-            runs = []
-            for number, identity in enumerate(who):
-                found = [
-                    handshake(server, Client(ClientConfig(mode=mode), identity, TRUST, "hub", 0.0), number * 10.0 + i)
-                    for i in range(count)
-                ]
-                runs.append(found[-1])
-            columns = [statistics.median(column) * 1e3 for column in zip(*runs, strict=True)]
-            print(f"  {mode.name.lower():9s} {label} {columns[0]:12.2f}{columns[1]:12.2f}")
+        return
+    aes = AESGCM(key)
+    print("  AES-GCM, OpenSSL           " + "".join(
+        f"{each(lambda s=s: aes.encrypt(nonce, bytes(s), header), 300):8.1f}" for s in sizes))
+
+
+def strangers() -> None:
     server = make_server()
     print("\nwhat a stranger costs the server, µs")
     hello = Hello(Mode.EXCHANGE, os.urandom(8), os.urandom(32)).to_bytes()
@@ -176,10 +196,69 @@ def main() -> None:
     print(f"  a PROOF with a cookie made up      {each(offered(forged), 2000):8.1f}")
     print(f"  1,200 bytes of noise               {each(offered(b'X' + os.urandom(1199)), 2000):8.1f}")
     print(f"  a packet of no connection          {each(offered(b'@' + os.urandom(1199)), 2000):8.1f}")
-    handshake(server, Client(ClientConfig(), robot("victim"), TRUST, "hub", 1.0), 1.0)
-    cid = next(iter(server._connections))
-    noise = b"@" + cid + (10**6).to_bytes(6, "big") + os.urandom(1185)
+    handshake(server, make_client(1.0), 1.0)
+    noise = b"@" + next(iter(server._connections)) + (10**6).to_bytes(4, "big") + os.urandom(1187)
     print(f"  a forged packet of a live session  {each(offered(noise), 500):8.1f}")
+
+
+def links() -> None:
+    """Through the simulated network of the tests: time to a session, and the rate for 60 seconds."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+    from bridge.channel.simulation import Faults, Network
+    from bridge.channel.world import RobotProgram, ServerProgram
+
+    print("\nseconds to a session, round trip 40 ms, 400 seeds     median    95 %")
+    for loss in (0.0, 0.1, 0.2, 0.3):
+        times = []
+        for seed in range(400 if loss else 2):
+            network = Network(seed, Faults(loss=loss, delay=0.02))
+            ServerProgram(network)
+            robot = RobotProgram(network, [])
+            events: list[float] = []
+            robot.host.on_event = lambda event, network=network, events=events: (
+                events.append(network.now) if isinstance(event, Connected) else None
+            )
+            network.run(lambda events=events: bool(events))
+            times.append(events[0] - 1000.0)
+        print(f"  {loss:4.0%} loss {statistics.median(times):46.2f}{statistics.quantiles(times, n=20)[-1]:8.2f}")
+    print("\nkB/s in the first 60 s, jitter 5 %      no loss     10 %     30 %")
+    for round_trip in (0.05, 0.2, 0.6):
+        row = []
+        for loss in (0.0, 0.1, 0.3):
+            network = Network(1, Faults(loss=loss, delay=round_trip / 2, jitter=round_trip / 20))
+            hub = ServerProgram(network)
+            robot = RobotProgram(network, [bytes(CHUNK)] * 10_000_000)
+            network.run(lambda robot=robot: robot.sent is not None)
+            began, end = network.now, network.now + 60.0
+            stored = hub.stored.setdefault("robot_1", [])
+            network.run(lambda network=network, end=end, stored=stored: network.now > end or len(stored) > 4000)
+            row.append(len(stored) * CHUNK / (network.now - began) / 1e3)
+        print(f"  round trip {round_trip * 1000:3.0f} ms" + " " * 16 + "".join(f"{rate:9.0f}" for rate in row))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--link", action="store_true", help="also simulate links with loss")
+    chosen = parser.parse_args()
+    print(f"{platform.python_implementation()} {platform.python_version()} on {platform.machine()}, "
+          f"{os.cpu_count()} cores; SM3: {sm3.ENGINE}")
+    ciphers()
+    print("\nper message, µs, no sockets        robot  server   MB/s of both on one core")
+    for size, count in ((200, 2000), (CHUNK, 300), (68_000, 40)):
+        robot, hub = carried(size, count)
+        print(f"  {size:6d} bytes {robot:25.0f}{hub:8.0f}{size / (robot + hub):10.2f}")
+    print("\nthrough loopback, two processes, chunks of 100 records")
+    sys.stdout.flush()
+    loopback(10.0)
+    print("\nhandshake, ms             server      client")
+    for mode in Mode:
+        server = make_server(mode=mode)
+        runs = [handshake(server, make_client(mode=mode), float(number)) for number in range(20)]
+        columns = [statistics.median(column) * 1e3 for column in zip(*runs, strict=True)]
+        print(f"  {mode.name.lower():9s} {columns[0]:18.2f}{columns[1]:12.2f}")
+    strangers()
+    if chosen.link:
+        links()
 
 
 if __name__ == "__main__":

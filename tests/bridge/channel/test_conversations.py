@@ -111,6 +111,14 @@ def test_without_faults_nothing_is_sent_twice():
         assert session.idle and not session._unacked and not session._early and session._buffered == 0
 
 
+def test_reordering_within_an_eighth_of_the_round_trip_is_not_taken_for_loss():
+    network = Network(2, Faults(delay=0.05, jitter=0.01))
+    ServerProgram(network)
+    robot = RobotProgram(network, [bytes(5000)] * 100)
+    assert network.run(lambda: robot.done)
+    assert robot.client.statistics().packets_lost < 5
+
+
 def test_datagrams_are_filled_to_the_last_byte_and_no_further():
     for size, count in ((SEGMENT_SIZE - 4, 1), (SEGMENT_SIZE - 3, 2)):
         network = Network(1, Faults())

@@ -1,0 +1,180 @@
+"""Loss detection, probes and acknowledgements of one session, packet by packet: RFC 9002 in exact numbers.
+
+The client's packets are kept from the server; the test answers in the server's name, and chooses what it acknowledges.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from bridge.channel.steps import Steps, events
+from bridge.channel.world import make_client
+from rosbridge_eth.channel import ClientConfig
+from rosbridge_eth.channel.delivery import MAX_PTO
+from rosbridge_eth.channel.wire import SEGMENT_SIZE, Ack, Frame
+
+
+class Line:
+    """A client whose packets nobody gets; `acknowledge` says the contrary of some of them."""
+
+    def __init__(self) -> None:
+        self.steps = Steps(client=make_client(1000.0, ClientConfig(patience=1000.0))).until_connected()
+        self.session = self.steps.client._session
+        self.now = 1000.0
+        self.acknowledge([0], round_trip=0.1)  # FINISHED; its round trip is the first sample
+        events(self.steps.client)
+
+    def pass_time(self, seconds: float) -> list[int]:
+        """Let every timer fire that is due until then; the numbers of the packets that were sent."""
+        end = self.now + seconds
+        sent = self.flush()
+        while (when := self.steps.client.next_timer()) is not None and when <= end:
+            self.now = max(self.now, when)
+            self.steps.client.handle_timer(self.now)
+            sent += self.flush()
+        self.now = end
+        return sent
+
+    def flush(self) -> list[int]:
+        sent = self.steps.client.datagrams_to_send(self.now)
+        return [int.from_bytes(data[9:13], "big") for data, _ in sent]
+
+    def send(self, *sizes: int) -> list[int]:
+        """Messages, each in packets of its own."""
+        numbers = []
+        for size in sizes:
+            self.steps.client.send(bytes(size - 4))
+            numbers += self.flush()
+        return numbers
+
+    def acknowledge(self, numbers: list[int], *, round_trip: float = 0.0, next_segment: int = 0) -> None:
+        self.now += round_trip
+        largest = max(numbers)
+        bits = sum(1 << largest - number for number in numbers)
+        [connection] = self.steps.server._connections.values()
+        frame = Ack(largest, 0.0, next_segment, 2000, bits).to_bytes()
+        self.steps.client.receive_datagram(connection.session._seal(frame), ("192.0.2.1", 4433), self.now)
+
+    @property
+    def counted(self) -> tuple[int, int]:
+        counted = self.steps.client.statistics()
+        return counted.packets_lost, counted.retransmitted
+
+
+def test_a_packet_is_lost_when_a_later_one_is_acknowledged_and_nine_eighths_of_a_round_trip_have_passed():
+    line = Line()
+    a, b, c = line.send(100, 100, 100)
+    line.acknowledge([b, c], round_trip=0.1)
+    assert line.counted == (0, 0)  # 1/8 of a round trip is left for what was overtaken
+    delay = line.session._round_trip.loss_delay()
+    assert delay == pytest.approx(9 / 8 * 0.1)
+    assert line.pass_time(delay - 0.1 - 0.001) == []
+    assert line.counted == (0, 0)
+    again = line.pass_time(0.002)
+    assert len(again) == 1 and line.counted == (1, 1)
+    line.acknowledge(again, round_trip=0.1)
+    assert line.session.idle and line.session._buffered == 0
+    line.acknowledge([a, b, c, *again])  # a late one, too, changes nothing
+    assert line.counted == (1, 1)
+
+
+def test_what_nobody_acknowledges_is_probed_and_not_taken_for_lost():
+    line = Line()
+    line.send(100, 100, 100)
+    pto = line.session.pto
+    assert line.pass_time(pto - 0.001) == []
+    for count in range(1, 4):
+        assert len(line.pass_time(0.002)) == 2
+        assert line.counted == (0, 2 * count)
+        assert line.pass_time(pto * 2**count - 0.003) == []
+        line.pass_time(0.001)
+
+
+def test_the_probe_timeout_is_four_seconds_at_most_and_short_again_after_an_acknowledgement():
+    line = Line()
+    line.send(100)
+    sent = line.pass_time(60.0)
+    assert 60 / MAX_PTO <= len(sent) / 2 <= 60 / MAX_PTO + 8
+    line.acknowledge(sent[-1:])
+    line.send(100)
+    before = line.session.pto
+    assert len(line.pass_time(before + 0.001)) == 2
+
+
+def test_a_segment_is_not_sent_again_for_a_packet_whose_place_another_has_taken():
+    line = Line()
+    line.send(100, 100)
+    probes = line.pass_time(line.session.pto + 0.001)
+    assert len(probes) == 2 and line.counted == (0, 2)
+    [later] = line.send(100)
+    line.acknowledge([later], round_trip=0.05)
+    assert line.counted == (2, 2)  # both packets of before are lost, but their segments are on their way already
+    line.acknowledge([*probes, later])
+    assert line.session.idle and line.counted == (2, 2)
+
+
+def test_a_segment_that_arrived_is_not_sent_again_though_its_packets_acknowledgement_was_lost():
+    line = Line()
+    line.send(100, 100)
+    [third] = line.send(100)
+    line.acknowledge([third], round_trip=0.1, next_segment=4)  # segments 1 to 3, that is all of them
+    assert line.session._unacked == {} and line.session._buffered == 0
+    line.pass_time(1.0)
+    assert line.counted[1] == 0
+
+
+def test_only_what_is_named_is_acknowledged():
+    line = Line()
+    numbers = line.send(*[100] * 9)
+    line.acknowledge([numbers[0], numbers[3], numbers[8]])
+    assert sorted(line.session._in_flight) == [n for i, n in enumerate(numbers) if i not in (0, 3, 8)]
+    assert len(line.session._unacked) == 6
+
+
+def test_what_is_lost_goes_again_in_the_order_of_the_stream_and_before_what_is_new():
+    line = Line()
+    line.send(*[SEGMENT_SIZE] * 5)
+    [last] = line.send(100)
+    order: list[int] = []
+    real = line.session._seal
+    line.session._seal = lambda frames: order.append(int.from_bytes(frames[1:5], "big")) or real(frames)
+    line.acknowledge([last], round_trip=0.2)
+    line.steps.client.handle_timer(line.now + 0.05)
+    line.steps.client.send(bytes(50))
+    line.flush()
+    assert order == [1, 2, 3, 4, 5, 7]
+
+
+def test_without_an_outage_the_window_is_kept_and_after_one_it_begins_anew():
+    line = Line()
+    before = line.session._window.size
+    line.send(100)
+    pto = line.session.pto
+    line.pass_time(3 * pto + 0.01)  # two probe timeouts
+    assert line.session._window.size == before
+    line.pass_time(4 * pto)
+    assert line.session._window.size == 2 * 1200
+
+
+def test_an_end_acknowledges_after_eight_packets_at_once_at_a_gap_and_else_after_its_delay():
+    steps = Steps().until_connected()
+    [connection] = steps.server._connections.values()
+    steps.now += 0.03
+    steps.to_server(*(data for data, _ in steps.client.datagrams_to_send(steps.now)))
+    assert connection.session.idle
+    client, session = steps.client._session, connection.session
+
+    def ping() -> list[bytes]:
+        return steps.to_server(client._seal(bytes((Frame.PING,))))
+
+    assert [len(ping()) for _ in range(17)] == [0] * 7 + [1] + [0] * 7 + [1] + [0]
+    assert session.timer(steps.now) == pytest.approx(steps.now + 0.02)
+    client.next_number += 1
+    assert len(ping()) == 1  # a number is missing
+    assert len(ping()) == 0
+    steps.now += 0.02
+    steps.server.handle_timer(steps.now)
+    assert len(steps.server.datagrams_to_send(steps.now)) == 1
+    assert session.timer(steps.now) > steps.now + 1.0
+    assert steps.to_server(client._seal(Ack(0, 0.0, 1, 1025, 1).to_bytes())) == []  # asks for nothing, gets nothing
+    assert session.timer(steps.now) > steps.now + 1.0
