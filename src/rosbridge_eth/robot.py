@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 
 from rosbridge_eth.capture import Capture, Captured, Decoder, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Mode
@@ -34,11 +33,10 @@ from rosbridge_eth.sender import Sender
 from rosbridge_eth.sources import BagSource, Source, open_source
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.writer import LogWriter
-from smcrypto import sm2, x509
+from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)
 
-SOFTWARE = f"rosbridge_eth {version('pysmcrypto')}"
 RING = 4096  # raw messages between the source's thread and the loop
 TAKE = 128  # raw messages captured before the network gets its turn again
 LONGEST_WAIT = 0.25
@@ -312,8 +310,9 @@ def open_robot(
     key = identity.signing_key
     spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
     now = time.monotonic()
+    first_line = stream_line(source.kind, f"rosbridge_eth {__version__}")
     writer = LogWriter(
-        place, key, readers, previous=spool.last_digest, stream_line=stream_line(source.kind, SOFTWARE),
+        place, key, readers, previous=spool.last_digest, stream_line=first_line,
         period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress, now=now,
     )
     client = Client(

@@ -10,7 +10,6 @@ import os
 import sqlite3
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Annotated
 
 import typer
@@ -19,6 +18,7 @@ from rosbridge_eth import demo, doctor, status
 from rosbridge_eth.cli import operator, reader, robot
 from rosbridge_eth.cli.terminal import talk
 from rosbridge_eth.errors import BridgeError, ExitCode
+from smcrypto import __version__
 
 app = typer.Typer(
     name="rosbridge-eth",
@@ -35,7 +35,7 @@ for part in (demo, operator, robot, reader, status, doctor):
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"rosbridge-eth {version('pysmcrypto')}")
+        typer.echo(f"rosbridge-eth {__version__}")
         raise typer.Exit
 
 
