@@ -20,7 +20,7 @@ SOURCES = Path(__file__).resolve().parent.parent / "src"
 LARGEST_FILE = 400
 
 PARTS = {
-    "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py"),
+    "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py", "terminal.py"),
     "config": ("config", "config.py"),
     "identity, home, registry, bundle, errors": (
         "identity.py", "home.py", "files.py", "registry.py", "administration.py", "bundle.py", "errors.py",

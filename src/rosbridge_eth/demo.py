@@ -291,11 +291,11 @@ def demo(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from rosbridge_eth.cli.terminal import data, errors, print_json, table, talk
     from rosbridge_eth.logs import log_to_stderr
     from rosbridge_eth.reading import outputs
     from rosbridge_eth.relay import Harm
     from rosbridge_eth.sources.bag import sample_bag
+    from rosbridge_eth.terminal import data, errors, print_json, table, talk
 
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work

@@ -28,7 +28,6 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
 from rosbridge_eth.chunk import Log, robot_id
-from rosbridge_eth.cli.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.database import InUse, NothingThere
@@ -37,6 +36,7 @@ from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, ki
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.status import DEAD, ask_monitor, span
+from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger

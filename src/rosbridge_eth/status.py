@@ -20,13 +20,13 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosbridge_eth.chunk import Chunk, Log, robot_id
-from rosbridge_eth.cli.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 from rosbridge_eth.config import ServerConfig, load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.config.values import duration_text
 from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role
+from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.inbox import Inbox

@@ -16,8 +16,8 @@ import typer
 
 from rosbridge_eth import demo, doctor, status
 from rosbridge_eth.cli import operator, reader, robot
-from rosbridge_eth.cli.terminal import talk
 from rosbridge_eth.errors import BridgeError, ExitCode
+from rosbridge_eth.terminal import talk
 from smcrypto import __version__
 
 app = typer.Typer(

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rosbridge_eth.cli.terminal import (
+from rosbridge_eth.config import load_server_config
+from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
+from rosbridge_eth.home import OperatorHome, ReaderHome
+from rosbridge_eth.identity import Role, load_ca
+from rosbridge_eth.logs import LogFormat, log_to_stderr
+from rosbridge_eth.passphrases import read_passphrase
+from rosbridge_eth.terminal import (
     OPERATOR_HOME,
     READER_HOME,
     AnyHomeOption,
@@ -25,12 +31,6 @@ from rosbridge_eth.cli.terminal import (
     talk,
     utc_now,
 )
-from rosbridge_eth.config import load_server_config
-from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
-from rosbridge_eth.home import OperatorHome, ReaderHome
-from rosbridge_eth.identity import Role, load_ca
-from rosbridge_eth.logs import LogFormat, log_to_stderr
-from rosbridge_eth.passphrases import read_passphrase
 
 if TYPE_CHECKING:
     from rosbridge_eth.identity import CertificateAuthority

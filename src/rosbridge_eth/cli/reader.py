@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rosbridge_eth.cli.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
 from rosbridge_eth.config import load_reader_config
 from rosbridge_eth.config.values import parse_time
 from rosbridge_eth.errors import ConfigError, VerificationError
 from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
+from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.reading import ProvenRecord

@@ -13,13 +13,13 @@ from typing import Annotated
 import typer
 
 from rosbridge_eth import bundle as bundles
-from rosbridge_eth.cli.terminal import ROBOT_HOME, LogFormatOption, PasswordFile, RobotHomeOption, Verbose, talk
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import RobotHome
 from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.reading.verdict import grouped
+from rosbridge_eth.terminal import ROBOT_HOME, LogFormatOption, PasswordFile, RobotHomeOption, Verbose, talk
 
 SOURCES = {
     "bag": "a bag",
