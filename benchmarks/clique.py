@@ -19,11 +19,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import requests
 from eth_account import Account
 from eth_keys.datatypes import PrivateKey
-
-from rosbridge_eth.ledger.failures import NodeFailure
-from rosbridge_eth.ledger.jsonrpc import JsonRpcChain
 
 CHAIN_ID, EPOCH, GAS_LIMIT = 4711, 30_000, 30_000_000
 PATIENCE = 60.0
@@ -81,8 +79,8 @@ class Node:
     def __init__(self, program: str, folder: Path, signer: PrivateKey) -> None:
         self._program, self._folder, self._signer = program, folder, signer
         self.signer = signer.public_key.to_checksum_address()
-        self.http_port, self.ws_port, self._peer_port, self._engine_port = free_ports(4)
-        self.url, self.ws_url = f"http://127.0.0.1:{self.http_port}", f"ws://127.0.0.1:{self.ws_port}"
+        self.http_port, self._peer_port, self._engine_port = free_ports(3)
+        self.url = f"http://127.0.0.1:{self.http_port}"
         # The node's name in the network is a public key too; the signer's serves.
         self.enode = f"enode://{signer.public_key.to_hex()[2:]}@127.0.0.1:{self._peer_port}?discport=0"
         self._process: subprocess.Popen[bytes] | None = None
@@ -106,11 +104,11 @@ class Node:
         options = {
             "datadir": self._folder, "nodekey": self._folder / "nodekey", "networkid": CHAIN_ID, "syncmode": "full",
             "port": self._peer_port, "nat": "none", "netrestrict": "127.0.0.0/8", "authrpc.port": self._engine_port,
-            "http.port": self.http_port, "http.api": "eth,net,web3,admin,miner", "ws.port": self.ws_port,
-            "ws.api": "eth,net,web3", "unlock": self.signer, "password": self._folder / "password",
-            "miner.etherbase": self.signer, "miner.gasprice": 1, "cache": 64, "verbosity": 3,
+            "http.port": self.http_port, "http.api": "eth,net,web3,admin,miner,debug", "unlock": self.signer,
+            "password": self._folder / "password", "miner.etherbase": self.signer, "miner.gasprice": 1, "cache": 64,
+            "verbosity": 3,
         }
-        flags = ["nodiscover", "ipcdisable", "http", "ws", "allow-insecure-unlock", "mine"]
+        flags = ["nodiscover", "ipcdisable", "http", "allow-insecure-unlock", "mine", "txpool.nolocals"]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
                 [self._program, *(f"--{flag}" for flag in flags), *(f"--{k}={v}" for k, v in options.items())],
@@ -121,20 +119,28 @@ class Node:
             try:
                 self.request("eth_chainId")
                 return
-            except NodeFailure as failure:
+            except (OSError, RuntimeError) as failure:
                 if self._process.poll() is not None or time.monotonic() > deadline:
                     raise RuntimeError(self.log.read_text(errors="replace")[-2000:]) from failure
                 time.sleep(0.05)
 
     def request(self, method: str, *params: object) -> Any:
-        chain = JsonRpcChain(self.url, timeout=5)
-        try:
-            return chain.request(method, *params)
-        finally:
-            chain.close()
+        """The result of any JSON-RPC call."""
+        body = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+        answer = requests.post(self.url, json=body, timeout=5).json()
+        if "error" in answer:
+            raise RuntimeError(f"{method}: {answer['error']}")
+        return answer["result"]
 
     def height(self) -> int:
         return int(self.request("eth_blockNumber"), 16)
+
+    def restart(self) -> None:
+        """An orderly end and a new start: what waited in its pool is gone."""
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait(PATIENCE)
+        self.start()
 
     def kill(self) -> None:
         """As a power cut would; what it had not written to its disk is gone."""
