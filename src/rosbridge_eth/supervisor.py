@@ -30,14 +30,14 @@ from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
-from rosbridge_eth.identity import Identity, Role
+from rosbridge_eth.identity import Identity
 from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.ledger.submitter import Settings as SubmitterSettings
 from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.logs import Trouble
-from rosbridge_eth.registry import Registry
+from rosbridge_eth.registry import Enrolment, Registry
 from rosbridge_eth.server import Reception, Worker
 
 if TYPE_CHECKING:
@@ -107,22 +107,29 @@ def open_reception(
         time.monotonic(),
     )
 
-    def certificates(name: str) -> bytes | None:
-        found = registry.find(Role.ROBOT, name)
-        return None if found is None else found.hash
-
-    return Reception(server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates)
+    return Reception(
+        server, inbox, deployment.ledger, allowed=registry.allows, certificates=registry.certificates_hash
+    )
 
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
     """The submitter for all robots of a registry."""
 
+    known: dict[object, dict[bytes, Enrolment]] = {}  # the robots, by the registry's revision
+
+    def robots() -> dict[bytes, Enrolment]:
+        revision = registry.revision()
+        if revision not in known:
+            known.clear()
+            known[revision] = registry.robots()
+        return known[revision]
+
     def account(tk: bytes) -> LocalAccount | None:
-        found = registry.robots().get(tk)
+        found = robots().get(tk)
         return None if found is None else keys.robot(found.number)
 
     return Submitter(
-        ledger, inbox, lambda: registry.robots().keys(), account, keys.operator,
+        ledger, inbox, lambda: robots().keys(), account, keys.operator,
         SubmitterSettings(
             confirmations=config.chain.confirmations, max_fee=int(config.chain.max_fee_gwei * 10**9),
             low_water=int(config.funds.below * WEI_PER_ETH), top_up=int(config.funds.by * WEI_PER_ETH),
