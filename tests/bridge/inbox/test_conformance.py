@@ -131,8 +131,9 @@ SIZE = len(chunk(0).encoded)
 
 
 def test_a_robot_that_fills_its_share_blocks_no_other_and_none_of_its_later_chunks_overtakes(backend):
-    inbox = backend.open(max_bytes=20 * SIZE, share=4 * SIZE)
+    inbox = backend.open(max_bytes=20 * SIZE, share=5 * SIZE - 1)
     small = chunk(5, size=0)
+    assert len(small.encoded) < SIZE - 1
     made = list(chain(5))
     batch = [(A, one) for one in made] + [(B, chunk(0)), (A, small), (A, made[1]), (B, chunk(1))]
     assert inbox.append(batch, T0) == [STORED] * 4 + [FULL, STORED, FULL, KNOWN, STORED]

@@ -104,10 +104,16 @@ def test_at_maxmemory_nothing_is_taken_in_part_and_what_is_there_drains(server):
                 put(inbox, *range(taken, taken + 10), size=30_000)
         assert held(inbox) == list(range(taken))
         assert inbox.head(A, STREAM).number == taken - 1
+        client.config_set("maxmemory", client.info("memory")["used_memory"] // 2)
         inbox.set_state(A, hold="why")
         inbox.confirm(A, inbox.rows(A, None, PLENTY)[69].position, 1.0)
         inbox.forget(2.0)
         assert held(inbox) == list(range(69, taken))
+        inbox.rebase(A, chunk(70, size=30_000), [], {}, 1.0)
+        inbox.confirm(A, inbox.rows(A, None, 1)[0].position, 1.0)
+        with pytest.raises(StoreError, match="maxmemory"):
+            put(inbox, taken)
+        client.config_set("maxmemory", client.info("memory")["used_memory"] + 1_000_000)
         assert put(inbox, taken, size=30_000) == [STORED]
     inbox.close()
 
