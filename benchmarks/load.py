@@ -1,21 +1,24 @@
 """Many robots at once: from their handshakes to the chain, each stage counted and timed.
 
-    python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--store sqlite|redis|URL]
-                              [--chain anvil|embedded] [--workers 2] [--json FILE]
+    python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--per-chunk 1]
+                              [--store sqlite|redis|URL] [--chain anvil|embedded] [--workers 2] [--json FILE]
 
 The paper's blockchain end received 2,994, 4,986 and 6,991 messages of 300, 500
 and 700 clients that sent 10 each, and so lost 0.23 % (Security and
 Communication Networks 2022, article 7206494, Table 4).
 
 Everything is real but the robots' hardware: every session has an identity,
-certificates, an account, a registration in the contract, a socket and records
-sealed from the sample bag's Odometry. The sessions are spread over a few
-client processes. The server's workers share one UDP port, commit to the inbox
-and answer; the submitter writes to the chain; at the end every robot's history
-is fetched from there and compared byte by byte with what was sealed.
+certificates, an account, a registration in the contract, a spool, a socket and
+chunks of the sample bag's Odometry, sealed by the robot's writer; each message
+is a chunk of its own, as if it were the only one of its second. The sessions
+are spread over a few client processes. The server's workers share one UDP
+port, commit to the inbox and answer; the submitter writes to the chain, and
+the robots are told what is confirmed. At the end every robot's log is read
+back from the chain, compared byte by byte with what was sealed, verified and
+opened with the reader's key, and its messages compared with those captured.
 
 All robots of a run begin at the same moment, from one address: the worst case.
-They send when all sessions stand, so that handshakes and messages are timed
+They send when all sessions stand, so that handshakes and chunks are timed
 apart.
 """
 
@@ -35,64 +38,55 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from functools import partial
-from hashlib import blake2b
+from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from rosbridge_eth import identity as ids
-from rosbridge_eth import ledger, protocol
-from rosbridge_eth.capture import Capture, TopicRule
-from rosbridge_eth.channel import Client, ClientConfig, Connected, Disconnected, MessageAnswered
+from rosbridge_eth import server as door
+from rosbridge_eth.administration import deploy_contract, init_home, load_server_identity, register_robot
+from rosbridge_eth.bundle import Request, read_bundle
+from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
+from rosbridge_eth.channel import Client, ClientConfig
 from rosbridge_eth.channel.protection import Direction
-from rosbridge_eth.channel.udp import client_socket, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import load_server_config
-from rosbridge_eth.home import OperatorHome
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.embedded import EmbeddedChain
-from rosbridge_eth.protocol import Ack, RecordRequest
-from rosbridge_eth.reading import join_certificates
-from rosbridge_eth.records import RecordId, SealedRecord
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.sealing import Sealer
-from rosbridge_eth.server.administration import (
-    allot,
-    ca_certificate,
-    deploy_contract,
-    init_home,
+from rosbridge_eth.errors import StoreError
+from rosbridge_eth.home import OperatorHome, ReaderHome
+from rosbridge_eth.identity import (
+    CertificateAuthority,
+    Identity,
+    Role,
+    Trust,
     load_ca,
-    load_server_identity,
-    server_trust,
+    load_identity,
+    public_identity,
 )
-from rosbridge_eth.server.assembly import bound_contract, open_inbox, open_journal, open_submission, open_worker
-from rosbridge_eth.sources import BagSettings, Selection
-from rosbridge_eth.sources.bag import BagSource
-from rosbridge_eth.sources.sample import sample_bag
+from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
+from rosbridge_eth.reading import Verifier
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.sender import Sender
+from rosbridge_eth.server import Worker
+from rosbridge_eth.sources import BagSettings, BagSource, Selection
+from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
+from rosbridge_eth.writer import LogWriter
+from smcrypto import sm2
 
 TOPIC = "/robot_1/odom"
 PAPER = {300: 2994, 500: 4986, 700: 6991}
-BUSY_PAUSE = 0.2  # s
 FORK = multiprocessing.get_context("fork")
-RICH = 100_000 * 10**18
+RICH = 100_000
+MIB = 1 << 20
 DURABLE = ("--appendonly", "yes", "--appendfsync", "always", "--maxmemory-policy", "noeviction", "--save", "")
-
-
-@dataclass(frozen=True)
-class Robot:
-    """One session's secrets and place."""
-
-    identity: ids.Identity
-    number: int
-
-    @property
-    def tk(self) -> bytes:
-        return self.identity.public.robot_id
 
 
 @dataclass
@@ -101,27 +95,33 @@ class Figures:
 
     sessions: int
     messages: int
+    per_chunk: int
     store: str
     chain: str
     workers: int
     load_average: float = 0.0
     established: int = 0
     sent: int = 0
+    chunks: int = 0
     stored: int = 0
     on_chain: int = 0
+    equal: int = 0
     lost: int = 0
     doubled: int = 0
     altered: int = 0
+    unsound: list[str] = field(default_factory=list)
     connecting: float = 0.0
     sending: float = 0.0
     to_chain: float = 0.0
     handshake_cpu_ms: float = 0.0
     message_cpu_ms: float = 0.0
+    submitter_cpu_ms: float = 0.0
     opening_ms: float = 0.0
     opened: int = 0
+    verifying_ms: float = 0.0
+    verified: int = 0
     retransmitted: int = 0
     reconnected: int = 0
-    busy: int = 0
     batches: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
     worker_mib: list[float] = field(default_factory=list)
@@ -129,48 +129,55 @@ class Figures:
     submitter_mib: float = 0.0
 
 
-def digest(ciphertext: bytes) -> bytes:
-    return blake2b(ciphertext, digest_size=16).digest()
-
-
 # --- the operator: a home, a chain, a contract, robots
 
 
 class Operator:
-    """An operator's home with many robots enrolled, registered and funded, and the chain they write to."""
+    """An operator's home with many robots registered and funded, and the chain they write to.
 
-    def __init__(self, folder: Path, chain: str, store: str, robots: int, on_stage: Callable[[str], None]) -> None:
+    settings: TOML for server.toml, besides what `init` writes.
+    """
+
+    def __init__(
+        self, folder: Path, chain: str, store: str, robots: int, on_stage: Callable[[str], None], settings: str = "",
+        listen: str = "127.0.0.1:0",
+    ) -> None:  # fmt: skip
         self._stack = ExitStack()
-        self.home, self.chain_kind, self.store_kind = OperatorHome(folder / "operator"), chain, store
-        passphrase, now = secrets.token_hex(16).encode(), datetime.now(UTC)
+        self.folder, self.chain_kind, self.store_kind = folder, chain, store
+        self.home, self.reader_home = OperatorHome(folder / "operator"), ReaderHome(folder / "reader")
+        self.passphrase, now = secrets.token_hex(16).encode(), datetime.now(UTC)
         on_stage(f"a chain ({chain}) and a contract")
-        url = "embedded"
+        self.anvil: Anvil | None = None
+        where: Any = "http://127.0.0.1:8545"
         if chain == "anvil":
-            from rosbridge_eth.ledger import anvil
-
             # Blocks come when there is something to write: the node is not what is measured.
-            url = self._stack.enter_context(anvil.start(_free_port())).url
-        init_home(self.home, passphrase, listen="127.0.0.1:0", public=None, chain_url=url, server="server", now=now)
-        store_url = self._open_store(folder, store)
+            self.anvil = self._stack.enter_context(Anvil.start(_free_port()))
+            where = self.anvil.url
+        self.keys = init_home(
+            self.home, self.passphrase, reader=self.reader_home, reader_passphrase=self.passphrase, now=now,
+            listen=listen, public="127.0.0.1:7410", chain_url=where,
+        )
+        more = f'confirmations = 1\n\n[store]\nurl = "{self._open_store(folder, store)}"\n{settings}'
         with self.home.config.open("a") as file:
-            file.write(f'confirmations = 1\n\n[store]\nurl = "{store_url}"\n')
+            file.write(more)
         self.config = load_server_config(self.home.config)
-        self.keys = Keyring.load(self.home.accounts, passphrase)
-        self.chain: Any
-        if chain == "anvil":
-            self.chain = ledger.connect(url)
-            self.chain.request("anvil_setBalance", self.keys.operator.address, hex(RICH))
+        if self.anvil is not None:
+            self.anvil.fund(self.keys.operator.address, RICH)
         else:
-            self.chain = EmbeddedChain(fund={self.keys.operator.address: RICH})
-        self.deployment = deploy_contract(self.home, self.chain, self.keys)
-        self.contract = bound_contract(self.chain, self.deployment)
-        self.server = load_server_identity(self.home, passphrase)
-        ca = load_ca(self.home, passphrase)
-        self.reader = ids.enrol(ca, ids.Role.READER, "load", at=now)
+            where = EmbeddedChain(fund={self.keys.operator.address: RICH * 10**18})
+        self._where = where
+        self.deployment = deploy_contract(self.home, where, self.keys)
+        self.ledger = Ledger.connect(where, self.deployment)
+        self.server = load_server_identity(self.home, self.passphrase)
+        self.reader, roots = load_identity(self.reader_home.path, self.passphrase)
+        self.trust = Trust(roots)
         on_stage(f"{robots} robots: keys, certificates, accounts, registrations in the contract")
-        registry = Registry(self.home.registry)
-        self.robots = [self._register(registry, ca, number, now) for number in range(1, robots + 1)]
-        registry.close()
+        ca = load_ca(self.home.ca, self.passphrase, now)
+        self.robots = [self._register(ca, f"robot_{number}", now) for number in range(1, robots + 1)]
+        self.sealed: dict[bytes, bytes] = {}
+        """By digest, the chunks of all runs."""
+        self.spools = folder / "spools"
+        self.spools.mkdir()
 
     def _open_store(self, folder: Path, store: str) -> str:
         if store != "redis":
@@ -187,68 +194,86 @@ class Operator:
             time.sleep(0.02)
         return f"redis://127.0.0.1:{port}/0"
 
-    def _register(self, registry: Registry, ca: ids.CertificateAuthority, number: int, now: datetime) -> Robot:
-        """As `register` does it, without a bundle."""
-        robot = Robot(ids.enrol(ca, ids.Role.ROBOT, f"robot_{number}", at=now), registry.next_number())
-        peer, account = robot.identity.public, self.keys.robot(robot.number).address
-        certificates = join_certificates(peer.signing_certificate.to_der(), peer.encryption_certificate.to_der())
-        self.contract.transact(self.keys.operator, "registration", robot.tk, account, certificates)
-        allot(self.contract, self.keys, account, self.config)
-        registry.enrol(
-            number=robot.number, role=peer.role, name=peer.name, account=account, now=now, replace=False,
-            fingerprint=peer.signing_certificate.fingerprint(),
-            certificates=peer.signing_certificate.to_pem() + peer.encryption_certificate.to_pem(),
+    def _register(self, ca: CertificateAuthority, name: str, now: datetime) -> Identity:
+        """As `join` and `register` do it; only the keys are kept in no file."""
+        keys = [sm2.PrivateKey.generate() for _ in range(2)]
+        made = register_robot(
+            self.home, name, ca=ca, keys=self.keys, ledger=self.ledger, now=now, request=Request.make(name, *keys),
+            inbox=lambda: open_store(self.config, self.home),
         )
-        return robot
+        files = read_bundle(made.bundle.read_bytes()).certificates
+        peer = public_identity((files["sign.crt.pem"] + files["enc.crt.pem"]).encode())
+        return Identity(
+            Role.ROBOT, name, keys[0], peer.signing_certificate, keys[1], peer.encryption_certificate
+        )  # fmt: skip
 
     def close(self) -> None:
-        self.chain.close()
+        self.ledger.close()
         self._stack.close()
+
+    def connect(self) -> Ledger:
+        """The contract, for one process. The embedded chain lives in the process that asks."""
+        return Ledger.connect(self._where, self.deployment)
 
     # The server's processes, made of the parts that the supervisor forks.
 
     def work(self, number: int, sock: socket.socket, report: Connection) -> None:
         stopped = _until_terminated()
-        opening = _time_opening()
-        registry = Registry(self.home.registry)
-        worker = open_worker(
-            number, sock, config=self.config, identity=self.server, trust=server_trust(self.home, registry),
-            registry=registry, inbox=open_inbox(self.config, self.home),
-            journal=open_journal(self.home, self.deployment), deployment=self.deployment,
+        opening = _time_calls(Direction, "open")
+        verifying = _time_calls(door, "verify")
+        reception = open_reception(
+            number, self.config, self.server, self.home, Registry(self.home.registry),
+            open_store(self.config, self.home), self.deployment,
         )
+        worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
         before = resident_kib()
         worker.run(stopped)
-        statistics = worker.server.statistics()
         report.send({
-            "opening": opening, "dropped": dict(statistics.dropped), "acks": dict(worker.reception.acks),
-            "before": before, "peak": peak_kib(), "handshakes": statistics.handshakes,
-        })
+            "opening": opening, "verifying": verifying, "dropped": dict(reception.server.statistics().dropped),
+            "before": before, "peak": peak_kib(),
+        })  # fmt: skip
 
-    def submit(self, confirmed: Any, report: Connection) -> None:
-        """The submitter; when it is ended, it reads back what the chain holds of the robots it is given."""
+    def submit(self, report: Connection) -> None:
+        """The submitter; when it is ended, it reads back what the chain has of as many robots as it is told."""
         stopped = _until_terminated()
-        chain = self.chain if self.chain_kind == "embedded" else ledger.connect(self.config.chain.url)
-        contract = bound_contract(chain, self.deployment)
-        batches = 0
-
-        def count(timing: ledger.BatchTiming) -> None:
-            nonlocal batches
-            batches += 1
-            confirmed.value += timing.records
-
-        submission = open_submission(
-            config=self.config, contract=contract, journal=open_journal(self.home, self.deployment),
-            inbox=open_inbox(self.config, self.home), registry=Registry(self.home.registry), keys=self.keys,
-            on_confirmed=count,
+        ledger = self.connect()
+        submitter = open_submitter(
+            self.config, ledger, open_store(self.config, self.home), Registry(self.home.registry), self.keys
         )
-        submission.run(stopped)
+        while not stopped():
+            try:
+                wait = submitter.turn(time.time())
+            except StoreError:
+                wait = 0.25  # as the supervisor does; the inbox connects anew
+            time.sleep(min(wait, 0.25))
         peak = peak_kib()
-        found: list[tuple[RecordId, bytes]] = []
-        for tk in report.recv():
-            history = ledger.fetch(chain, contract, tk)
-            history.require_sound()
-            found += [(one.record.id, digest(one.record.ciphertext)) for one in history.records]
-        report.send({"found": found, "peak": peak, "batches": batches})
+        robots = self.robots[: report.recv()]
+        report.send({"found": [read_back(self, ledger, robot) for robot in robots], "peak": peak})
+
+
+@dataclass(frozen=True)
+class ReadBack:
+    """A robot's log on the chain: its chunks by batch, the lines of its messages by chunk's digest, findings."""
+
+    batches: list[tuple[bytes, ...]]
+    lines: dict[bytes, list[bytes]]
+    findings: list[str]
+
+
+def read_back(operator: Operator, ledger: Ledger, robot: Identity) -> ReadBack:
+    """As a reader does it; the events by their links, since the embedded chain is slow where there is nothing."""
+    tk = robot_id(robot.name)
+    [standing] = ledger.standings([tk])
+    events = list(ledger.newest_data(tk, standing.data_block))[::-1]
+    verifier = Verifier(
+        robot.name, ledger.ledger, standing, ledger.registrations(tk, standing), trust=operator.trust,
+        reader=operator.reader.encryption_key, block=ledger.block_number(), block_time=ledger.block_time,
+        now=time.time(),
+    )
+    lines = {one.place.digest: [record.line for record in one.records] for one in verifier.read(events)}
+    verdict = verifier.verdict(())
+    findings = [] if verdict.sound else [f"{robot.name}: {line}" for line in verdict.lines()]
+    return ReadBack([event.chunks for event in events], lines, findings)
 
 
 def _until_terminated() -> Callable[[], bool]:
@@ -258,20 +283,20 @@ def _until_terminated() -> Callable[[], bool]:
     return lambda: bool(asked)
 
 
-def _time_opening() -> dict[str, float]:
-    """From now on, the processor time that this process takes to decrypt and authenticate packets is added up here."""
-    total = {"seconds": 0.0, "packets": 0}
-    plain = Direction.open
+def _time_calls(owner: Any, name: str) -> dict[str, float]:
+    """From now on, the processor time that this process spends in a function is added up here."""
+    total = {"seconds": 0.0, "calls": 0}
+    plain = getattr(owner, name)
 
-    def timed(self: Direction, datagram: bytes, number: int) -> bytes:
+    def timed(*arguments: Any) -> Any:
         started = time.thread_time()
         try:
-            return plain(self, datagram, number)
+            return plain(*arguments)
         finally:
             total["seconds"] += time.thread_time() - started
-            total["packets"] += 1
+            total["calls"] += 1
 
-    Direction.open = timed  # type: ignore[method-assign]
+    setattr(owner, name, timed)
     return total
 
 
@@ -310,36 +335,65 @@ def cpu_seconds(pids: Sequence[int]) -> float:
 # --- the robots' end
 
 
-def payloads(count: int) -> list[bytes]:
-    """Captured Odometry of the sample bag, as robots seal it."""
+@cache
+def captured(count: int) -> tuple[list[bytes], str, bytes]:
+    """Lines of the sample bag's Odometry as capture writes them, their type, and its definition's line."""
     bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
-    capture, captured = Capture([TopicRule(TOPIC)]), list[bytes]()
+    capture, lines = Capture([TopicRule(TOPIC)], source_kind="bag"), list[bytes]()
     for raw in bag.messages():
-        record = capture.process(raw, time.time_ns(), time.monotonic_ns(), True)
+        record = capture.process(raw, time.time_ns(), True)
         if record is not None:
-            captured.append(record.to_json())
-        if len(captured) == count:
+            lines.append(record.line)
+        if len(lines) == count:
             break
     bag.close()
-    return captured
+    return lines, raw.type_name, definition_line(raw.decoder)
+
+
+def seal_all(writer: LogWriter, messages: int, per_chunk: int) -> Iterator[Chunk]:
+    """A whole stream of so many messages, that says goodbye."""
+    lines, type_name, definition = captured(messages)
+    now = 0.0
+    for number, line in enumerate(lines, 1):
+        writer.add(line, now, type_name=type_name, definition_line=lambda: definition)
+        if number % per_chunk == 0 and number < messages:
+            now += 10.0  # `period` is over
+            yield from writer.closed(now, time.time_ns() // 10**6)
+    yield from writer.finish(time.time_ns() // 10**6)
 
 
 class Session:
-    """A robot as the server sees it: sends its records, keeps each until it is acknowledged as stored."""
+    """A robot without source and process of its own: writer, spool, sender, channel and socket are the robot's."""
 
-    def __init__(self, robot: Robot, trust: ids.Trust, server: tuple[str, int], records: list[SealedRecord]) -> None:
+    def __init__(self, operator: Operator, robot: Identity, server: tuple[str, int]) -> None:
+        place = Log(operator.ledger.ledger, robot_id(robot.name))
+        self.robot, self._operator, self._server, self._place = robot, operator, server, place
+        key = robot.signing_key
+        self.spool = Spool(
+            operator.spools / f"{robot.name}.sqlite", place, max_bytes=64 * MIB, drop=partial(drop, place, key)
+        )
+        self._chunks: list[Chunk] = []
+        self._sending = False
+
+    def seal(self, messages: int, per_chunk: int) -> dict[bytes, bytes]:
+        writer = LogWriter(
+            self._place, self.robot.signing_key, [self._operator.reader.encryption_certificate.public_key],
+            previous=self.spool.last_digest, stream_line=stream_line("bag", "load"), now=0.0,
+        )
+        self._chunks = list(seal_all(writer, messages, per_chunk))
+        return {chunk.header.digest: chunk.encoded for chunk in self._chunks}
+
+    def connect(self) -> None:
         now = time.monotonic()
-        self.client = Client(ClientConfig(), robot.identity, trust, "server", now)
-        self.sock, address = client_socket(server)
-        self.records, self.todo = records, deque[SealedRecord]()
-        self.waiting: dict[int, SealedRecord] = {}
-        self.stored: set[RecordId] = set()
-        self.connected, self.sessions, self.busy, self.resume_at = False, 0, 0, 0.0
-        self.other: list[Ack] = []
+        self.client = Client(ClientConfig(), self.robot, self._operator.trust, "server", now)
+        self.sender = Sender(self.client, self.spool)
+        self.sock, address = client_socket(self._server)
         self.client.connect(address, now)
 
     def begin(self) -> None:
-        self.todo.extend(self.records)
+        """What was sealed is there to be sent from now on."""
+        for chunk in self._chunks:
+            self.spool.append(chunk)
 
     def turn(self, now: float, *, readable: bool) -> float:
         """Do what there is to do; when to be called again at the latest."""
@@ -353,70 +407,66 @@ class Session:
                 pass
         client.handle_timer(now)
         while (event := client.next_event()) is not None:
-            if isinstance(event, Connected):
-                self.connected = True
-                self.sessions += 1
-            elif isinstance(event, Disconnected):
-                self.connected = False
-                self.todo.extendleft(reversed([self.waiting.pop(id) for id in event.unanswered]))
-            elif isinstance(event, MessageAnswered):
-                self._answered(self.waiting.pop(event.message_id), protocol.decode_ack(event.payload), now)
-        while self.todo and now >= self.resume_at and client.writable(now):
-            record = self.todo.popleft()
-            self.waiting[client.send(protocol.encode_request(RecordRequest(record)))] = record
+            self.sender.handle(event, now)
+        self.sender.send(now)
         for data, place in client.datagrams_to_send(now):
             self.sock.sendto(data, place)
-        due = client.next_timer() or now + 1
-        return max(now, min(due, self.resume_at)) if self.todo and self.connected else due
-
-    def _answered(self, record: SealedRecord, ack: Ack, now: float) -> None:
-        if ack is Ack.STORED:
-            self.stored.add(record.id)
-        elif ack is Ack.BUSY:
-            self.busy += 1
-            self.todo.appendleft(record)
-            self.resume_at = now + BUSY_PAUSE
-        else:
-            self.other.append(ack)
+        return client.next_timer() or now + 1
 
     @property
-    def finished(self) -> bool:
-        return len(self.stored) + len(self.other) == len(self.records)
+    def connected(self) -> bool:
+        return self.sender.statistics.connected
+
+    @property
+    def stored(self) -> bool:
+        """The server has everything."""
+        return self.sender.idle
+
+    @property
+    def confirmed(self) -> bool:
+        """Everything is on the chain, as the server says."""
+        return self.spool.statistics().chunks == 0
+
+    def close(self) -> None:
+        self.spool.close()
+        self.sock.close()
 
 
 def client_process(
-    operator: Operator, robots: Sequence[Robot], server: tuple[str, int], messages: int, report: Connection,
-    limit: float,
+    operator: Operator, robots: Sequence[Identity], server: tuple[str, int], messages: int, per_chunk: int,
+    report: Connection, limit: float,
 ) -> None:
     """Several robots in one process. It reports after each phase and waits for the word to go on."""
-    trust = ids.Trust((ca_certificate(operator.home),))
-    captured = payloads(messages)
-    key = operator.reader.encryption_certificate.public_key
-    sealed: list[list[SealedRecord]] = []
-    for robot in robots:
-        sealer = Sealer(robot.tk, partial(ids.sign, robot.identity.signing_key), [key])
-        sealed.append([record for payload in captured for record in sealer.seal(payload, time.time_ns())])
-    report.send({record.id: digest(record.ciphertext) for records in sealed for record in records})
+    sessions = [Session(operator, robot, server) for robot in robots]
+    sealed: dict[bytes, bytes] = {}
+    for session in sessions:
+        sealed |= session.seal(messages, per_chunk)
+    report.send(sealed)
     report.recv()
-    sessions = [Session(robot, trust, server, own) for robot, own in zip(robots, sealed, strict=True)]
-    _drive(sessions, lambda session: session.connected, limit)
+    for session in sessions:
+        session.connect()
+    drive(sessions, lambda session: session.connected, limit)
     report.send(sum(session.connected for session in sessions))
-    _drive(sessions, lambda session: False, limit, report)
+    drive(sessions, lambda session: False, limit, report)
     report.recv()
     for session in sessions:
         session.begin()
-    _drive(sessions, lambda session: session.finished, limit)
+    report.send("begun")
+    drive(sessions, lambda session: session.stored, limit)
+    report.send(sum(session.spool.statistics().unstored for session in sessions))
+    drive(sessions, lambda session: session.confirmed, limit)
     report.send({
-        "stored": {id for session in sessions for id in session.stored},
-        "busy": sum(session.busy for session in sessions),
-        "reconnected": sum(session.sessions - 1 for session in sessions),
-        "retransmitted": sum(session.client.statistics().frames_retransmitted for session in sessions),
-        "other": Counter(ack.name for session in sessions for ack in session.other),
-    })
+        "sent": sum(session.sender.statistics.sent for session in sessions),
+        "refused": sum(session.sender.statistics.refused for session in sessions),
+        "reconnected": sum(session.sender.statistics.sessions - 1 for session in sessions),
+        "retransmitted": sum(session.client.statistics().retransmitted for session in sessions),
+    })  # fmt: skip
     report.recv()
+    for session in sessions:
+        session.close()
 
 
-def _drive(
+def drive(
     sessions: Sequence[Session], done: Callable[[Session], bool], limit: float, word: Connection | None = None
 ) -> None:
     """Until all are done, `limit` seconds have passed, or the word comes."""
@@ -434,7 +484,7 @@ def _drive(
         now = time.monotonic()
         for fd in {fd for fd, when in due.items() if when <= now} | ready:
             due[fd] = by_fd[fd].turn(now, readable=fd in ready)
-            if done(by_fd[fd]):
+            if fd in pending and done(by_fd[fd]):
                 pending.discard(fd)
 
 
@@ -454,36 +504,40 @@ def _processes() -> Iterator[Callable[..., tuple[Any, Connection]]]:
         running.append(process)
         return process, here
 
-    yield start
-    for process in running:
-        process.kill()
-        process.join()
+    try:
+        yield start
+    finally:
+        for process in running:
+            process.kill()
+            process.join()
 
 
 def run(
-    operator: Operator, sessions: int, messages: int, *, workers: int = 2, clients: int = 2, limit: float = 240.0,
-    on_stage: Callable[[str], None] = lambda text: None,
+    operator: Operator, sessions: int, messages: int, *, per_chunk: int = 1, workers: int = 2, clients: int = 2,
+    limit: float = 240.0, on_stage: Callable[[str], None] = lambda text: None,
 ) -> Figures:
     """One run with the first `sessions` robots of `operator`; `limit` is for each phase, in seconds."""
-    figures = Figures(sessions, messages, operator.store_kind, operator.chain_kind, workers)
-    figures.load_average = os.getloadavg()[0]
+    figures = Figures(sessions, messages, per_chunk, operator.store_kind, operator.chain_kind, workers)
+    figures.load_average, figures.sent = os.getloadavg()[0], sessions * messages
     robots = operator.robots[:sessions]
     sockets = server_sockets(("127.0.0.1", 0), workers)
     address = sockets[0].getsockname()[:2]
-    confirmed = FORK.Value("q", 0)
+    lines = captured(messages)[0]  # before the processes are forked, that all have the same
     with _processes() as start:
         serving = [start(operator.work, number, sock) for number, sock in enumerate(sockets)]
-        submitter, submitter_pipe = start(operator.submit, confirmed)
+        submitter, submitter_pipe = start(operator.submit)
         pids = [process.pid for process, _ in serving]
-        ends = [
-            start(lambda pipe, own=robots[n::clients]: client_process(operator, own, address, messages, pipe, limit))[1]
-            for n in range(clients)
-        ]
+
+        def client(own: Sequence[Identity], pipe: Connection) -> None:
+            client_process(operator, own, address, messages, per_chunk, pipe, limit)
+
+        ends = [start(client, robots[n::clients])[1] for n in range(clients)]
         on_stage(f"{sessions} robots seal {messages} messages each")
-        sealed: dict[RecordId, bytes] = {}
+        sealed: dict[bytes, bytes] = {}
         for pipe in ends:
-            sealed.update(pipe.recv())
-        opens = len(sealed) - sessions * messages  # each stream begins with its `open` record
+            sealed |= pipe.recv()
+        operator.sealed |= sealed
+        figures.chunks = len(sealed)
 
         on_stage("handshakes")
         cpu, started = cpu_seconds(pids), time.perf_counter()
@@ -494,19 +548,19 @@ def run(
         figures.handshake_cpu_ms = (cpu_seconds(pids) - cpu) / max(1, figures.established) * 1000
 
         on_stage("messages")
-        cpu, started = cpu_seconds(pids), time.perf_counter()
+        cpu, submitted = cpu_seconds(pids), cpu_seconds([submitter.pid])
         for pipe in ends:
             pipe.send("send")
-        reports = [pipe.recv() for pipe in ends]
+        for pipe in ends:
+            pipe.recv()
+        started = time.perf_counter()
+        figures.stored = figures.chunks - sum(pipe.recv() for pipe in ends)
         figures.sending = time.perf_counter() - started
-        figures.message_cpu_ms = (cpu_seconds(pids) - cpu) / max(1, len(sealed)) * 1000
-        stored = {id for report in reports for id in report["stored"]}
-
+        figures.message_cpu_ms = (cpu_seconds(pids) - cpu) / figures.sent * 1000
         on_stage("the chain")
-        deadline = time.perf_counter() + limit
-        while confirmed.value < len(stored) and time.perf_counter() < deadline:
-            time.sleep(0.05)
+        reports = [pipe.recv() for pipe in ends]
         figures.to_chain = time.perf_counter() - started
+        figures.submitter_cpu_ms = (cpu_seconds([submitter.pid]) - submitted) / figures.sent * 1000
         for pipe in ends:
             pipe.send("end")
         for process, _ in serving:
@@ -514,33 +568,35 @@ def run(
         served = [pipe.recv() for _, pipe in serving]
         on_stage("reading back")
         submitter.terminate()
-        submitter_pipe.send([robot.tk for robot in robots])
+        submitter_pipe.send(sessions)
         read = submitter_pipe.recv()
     for sock in sockets:
         sock.close()
 
-    # The operator's chain may hold earlier runs of the same robots, in other streams.
-    streams = {(id.robot, id.stream) for id in sealed}
-    found = [(id, seen) for id, seen in read["found"] if (id.robot, id.stream) in streams]
-    times_found = Counter(id for id, _ in found)
-    data = {id for id in sealed if id.seq > 0}
-    figures.sent = len(data)
-    figures.stored = len(stored & data)
-    figures.on_chain = len(data & times_found.keys())
-    figures.lost = len(sealed.keys() - times_found.keys())
-    figures.doubled = sum(times > 1 for times in times_found.values())
-    figures.altered = sum(sealed.get(id) != seen for id, seen in found)
-    figures.batches = read["batches"]
+    for found in read["found"]:
+        # The operator's chain may hold earlier runs of the same robots.
+        chunks = [(Chunk.parse(chunk).header.digest, chunk) for batch in found.batches for chunk in batch]
+        times = Counter(digest for digest, _ in chunks)
+        ours = [digest for digest in times if digest in sealed]
+        figures.on_chain += len(ours)
+        figures.doubled += sum(count > 1 for count in times.values())
+        figures.altered += sum(operator.sealed.get(digest) != chunk for digest, chunk in chunks)
+        said = [line for digest in ours for line in found.lines.get(digest, [])]
+        figures.equal += sum(one == other for one, other in zip(said, lines, strict=False))
+        figures.altered += max(0, len(said) - len(lines))
+        figures.unsound += found.findings
+        figures.batches += sum(Chunk.parse(batch[0]).header.digest in sealed for batch in found.batches)
+    figures.lost = figures.chunks - figures.on_chain
     figures.submitter_mib = read["peak"] / 1024
-    figures.opened = int(sum(one["opening"]["packets"] for one in served))
-    figures.opening_ms = sum(one["opening"]["seconds"] for one in served) * 1000
+    for name, what in (("opened", "opening"), ("verified", "verifying")):
+        setattr(figures, name, int(sum(one[what]["calls"] for one in served)))
+        setattr(figures, f"{what}_ms", sum(one[what]["seconds"] for one in served) * 1000)
     figures.dropped = dict(sum((Counter(one["dropped"]) for one in served), Counter()))
     figures.worker_mib = [one["peak"] / 1024 for one in served]
     figures.growth_kib_per_session = sum(one["peak"] - one["before"] for one in served) / sessions
-    for name in ("busy", "reconnected", "retransmitted"):
+    for name in ("reconnected", "retransmitted"):
         setattr(figures, name, sum(report[name] for report in reports))
-    if opens != sessions:
-        raise SystemExit(f"{opens} open records of {sessions} streams")
+    figures.altered += sum(report["refused"] for report in reports)
     return figures
 
 
@@ -552,23 +608,27 @@ def rows(figures: Figures) -> list[tuple[str, str]]:
     paper = PAPER.get(f.sessions) if f.messages == 10 else None
     return [
         ("sessions established", f"{f.established} of {f.sessions}"),
-        ("handshakes per second, all at once", f"{f.established / f.connecting:.0f}"),
-        ("server's processor time per handshake", f"{f.handshake_cpu_ms:.2f} ms"),
-        ("messages sent", f"{f.sent}"),
-        ("acknowledged as stored", f"{f.stored}"),
-        ("read back from the chain", f"{f.on_chain}"),
+        ("sessions a second, all at once", f"{f.established / f.connecting:.0f}"),
+        ("server's processor time a handshake", f"{f.handshake_cpu_ms:.2f} ms"),
+        ("messages sent, in chunks", f"{f.sent} in {f.chunks}"),
+        ("chunks acknowledged as stored", f"{f.stored}"),
+        ("chunks read back from the chain", f"{f.on_chain}"),
+        ("messages proven, opened and equal", f"{f.equal}"),
         ("**lost / doubled / altered**", f"**{f.lost} / {f.doubled} / {f.altered}**"),
         ("the paper: reached its server", f"{paper:,} ({(1 - paper / f.sent):.2%} lost)" if paper else "–"),
-        ("messages per second into the inbox", f"{f.sent / f.sending:.0f}"),
-        ("server's processor time per record, all of it", f"{f.message_cpu_ms:.3f} ms"),
+        ("messages a second into the inbox", f"{f.sent / f.sending:.0f}"),
+        ("server's processor time a message, workers", f"{f.message_cpu_ms:.3f} ms"),
         ("of it decrypting the channel", f"{f.opening_ms / max(1, f.opened):.3f} ms a packet, {f.opening_ms:.0f} ms"),
-        ("first message to last confirmation", f"{f.to_chain:.1f} s, {f.batches} transactions"),
+        ("of it verifying signatures",
+         f"{f.verifying_ms / max(1, f.verified):.3f} ms a chunk, {f.verifying_ms:.0f} ms"),
+        ("submitter's processor time a message", f"{f.submitter_cpu_ms:.3f} ms"),
+        ("first message to last confirmation at a robot", f"{f.to_chain:.1f} s, {f.batches} transactions"),
         ("peak memory of each worker", ", ".join(f"{mib:.0f} MiB" for mib in f.worker_mib)),
-        ("of it per session", f"{f.growth_kib_per_session:.1f} KiB"),
+        ("of it a session", f"{f.growth_kib_per_session:.1f} KiB"),
         ("peak memory of the submitter", f"{f.submitter_mib:.0f} MiB"),
-        ("frames sent again / sessions made again / busy", f"{f.retransmitted} / {f.reconnected} / {f.busy}"),
+        ("packets sent again / sessions made again", f"{f.retransmitted} / {f.reconnected}"),
         ("datagrams dropped by the server", ", ".join(f"{n} {why}" for why, n in f.dropped.items()) or "none"),
-    ]
+    ]  # fmt: skip
 
 
 def table(results: Sequence[Figures]) -> str:
@@ -595,6 +655,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, nargs="+", default=[300, 500, 700])
     parser.add_argument("--messages", type=int, default=10)
+    parser.add_argument("--per-chunk", type=int, default=1, help="messages in a chunk")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--store", default="sqlite", help="sqlite, redis (started here) or the URL of one")
     parser.add_argument("--chain", choices=["anvil", "embedded"],
@@ -611,7 +672,8 @@ def main() -> None:
         operator = Operator(Path(folder), options.chain, options.store, max(options.sessions), say)
         try:
             for count in options.sessions:
-                results.append(run(operator, count, options.messages, workers=options.workers, on_stage=say))
+                results.append(run(operator, count, options.messages, per_chunk=options.per_chunk,
+                                   workers=options.workers, on_stage=say))
         finally:
             operator.close()
     loads = ", ".join(f"{figures.load_average:.1f}" for figures in results)
@@ -619,7 +681,9 @@ def main() -> None:
           f" {options.workers} workers, {options.chain}\n\n{table(results)}")
     if options.json:
         options.json.write_text(json.dumps([asdict(figures) for figures in results], indent=1))
-    if any(f.lost or f.doubled or f.altered for f in results):
+    for figures in results:
+        print(*figures.unsound, sep="\n")
+    if any(f.lost or f.doubled or f.altered or f.unsound or f.equal != f.sent for f in results):
         raise SystemExit("records were lost, doubled or altered")
 
 
