@@ -203,9 +203,7 @@ class Operator:
         )
         files = read_bundle(made.bundle.read_bytes()).certificates
         peer = public_identity((files["sign.crt.pem"] + files["enc.crt.pem"]).encode())
-        return Identity(
-            Role.ROBOT, name, keys[0], peer.signing_certificate, keys[1], peer.encryption_certificate
-        )  # fmt: skip
+        return Identity(Role.ROBOT, name, peer.signing_certificate, peer.encryption_certificate, *keys)
 
     def close(self) -> None:
         self.ledger.close()
