@@ -171,10 +171,6 @@ class Server:
         for connection in list(self._connections.values()):
             self._remove(connection, End.CLOSED)
 
-    def peers(self) -> list[PeerIdentity]:
-        """Who has a session here."""
-        return [c.peer for c in self._connections.values() if c.state is ServerState.CONNECTED]
-
     def address_of(self, connection: bytes) -> Address | None:
         """Where the client of a connection is; None if the connection is gone."""
         found = self._connections.get(connection)

@@ -175,7 +175,7 @@ class UdpLoop:
 
     def close(self) -> None:
         """Send what the endpoint still has to say, and close the socket and what belongs to the loop."""
-        self._turn(self._clock())
+        self._flush(self._clock())
         self.socket.close()
         self._wake_receive.close()
         self._wake_send.close()
@@ -197,6 +197,9 @@ class UdpLoop:
         """Give out every event there is, and send what may be sent."""
         while (event := self.endpoint.next_event()) is not None:
             self._on_event(event)
+        self._flush(now)
+
+    def _flush(self, now: float) -> None:
         send = self.socket.sendto
         for data, address in self.endpoint.datagrams_to_send(now):
             try:

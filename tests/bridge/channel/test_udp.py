@@ -105,7 +105,7 @@ class Robot:
 
     def close(self) -> None:
         self.client.close(time.monotonic())
-        self.until(lambda: self.client.state == "idle")
+        self.loop.step(0.0)
         self.loop.close()
 
 
