@@ -225,11 +225,10 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
     sender = Sender(client, spool)
     near, address = client_socket(("127.0.0.1", port))
-    loop = UdpLoop(client, near, lambda event: sender.handle(event, time.monotonic()))
     client.connect(address, now)
     robot = Robot(
         source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
-        writer=who.writer(0.05, now), spool=spool, client=client, loop=loop, sender=sender,
+        writer=who.writer(0.05, now), spool=spool, client=client, socket=near, sender=sender,
     )  # fmt: skip
     started = time.perf_counter()
     robot.run()

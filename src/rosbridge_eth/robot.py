@@ -18,9 +18,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
+from socket import socket as Socket
+from typing import TypeVar
 
 from rosbridge_eth.capture import Capture, Captured, Decoder, RawMessage, TopicRule, definition_line, stream_line
-from rosbridge_eth.channel import Client, ClientConfig, Mode
+from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import RobotConfig
@@ -36,6 +38,7 @@ from rosbridge_eth.writer import LogWriter
 from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 RING = 4096  # raw messages between the source's thread and the loop
 TAKE = 128  # raw messages captured before the network gets its turn again
@@ -71,12 +74,13 @@ class Robot:
         writer: LogWriter,
         spool: Spool,
         client: Client,
-        loop: UdpLoop,
+        socket: Socket,
         sender: Sender,
         on_captured: Callable[[Captured], None] = lambda record: None,
     ) -> None:
         self.capture, self.writer, self.spool = capture, writer, spool
-        self.client, self.loop, self.sender = client, loop, sender
+        self.client, self.sender, self.loop = client, sender, UdpLoop(client, socket, self.handle)
+        sender.begin_stream = self.begin_stream
         self.source = source
         self.captured = 0
         self.chunks = 0
@@ -123,9 +127,9 @@ class Robot:
                     self._finish(now)
                 elif not finished:
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
-                self.sender.send(now)
+                self._spool_or(None, partial(self.sender.send, now))
                 on_turn()
-                if finished and not self._unspooled and self.sender.idle:
+                if finished and not self._unspooled and self._spool_or(False, self._idle):
                     break
                 self.loop.step(self._wait(now, finished))
             else:
@@ -140,7 +144,7 @@ class Robot:
             self._leave()
             self.source.close()
             reading.join(timeout=5)
-            self.summary = self._summarise()
+            self.summary = self._spool_or("the spool cannot be read", self._summarise)
             self.spool.close()
             self.loop.close()
         if self._source_error is not None:
@@ -228,10 +232,27 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.statistics.connected and not self.sender.idle and (now := time.monotonic()) < deadline:
+        while self.sender.statistics.connected and not self._spool_or(True, self._idle):
+            if (now := time.monotonic()) >= deadline:
+                break
             self._spool_chunks([], now)
-            self.sender.send(now)
+            self._spool_or(None, partial(self.sender.send, now))
             self.loop.step(0.02)
+
+    def _idle(self) -> bool:
+        return self.sender.idle
+
+    def handle(self, event: Event) -> None:
+        """Take one event of the client. What the spool cannot note at this moment the server says again."""
+        self._spool_or(None, partial(self.sender.handle, event, time.monotonic()))
+
+    def _spool_or(self, otherwise: _T, call: Callable[[], _T]) -> _T:
+        """What `call` gives, or `otherwise` where the spool does not work; a full disk does not end a robot."""
+        try:
+            return call()
+        except StoreError as error:
+            self.spool_trouble.now(str(error))
+            return otherwise
 
     def _leave(self) -> None:
         """End the session in good order, so that the server need not wait for a silent robot."""
@@ -321,13 +342,11 @@ def open_robot(
     )
     sender = Sender(client, spool, channel=config.channel, on_server_time=home.raise_clock_floor)
     socket, address = client_socket(config.server or parse_address(end.server_address))
-    loop = UdpLoop(client, socket, lambda event: sender.handle(event, time.monotonic()))
-    client.connect(address, now)
     robot = Robot(
-        source=source, capture=capture, writer=writer, spool=spool, client=client, loop=loop, sender=sender,
+        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender,
         on_captured=on_captured,
-    )
-    sender.begin_stream = robot.begin_stream
+    )  # fmt: skip
+    client.connect(address, now)
     return robot
 
 

@@ -93,6 +93,8 @@ class Sender:
         if self._stream is None:
             self._ask(self._spool.first_unconfirmed(), now)
             return
+        if not self._client.writable(now):
+            return
         for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
             message = protocol.encode(Offer(chunk.encoded))
             if not self._client.writable(now, len(message)):

@@ -30,7 +30,7 @@ from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
-from rosbridge_eth.identity import Identity
+from rosbridge_eth.identity import Identity, Role
 from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
@@ -107,9 +107,12 @@ def open_reception(
         time.monotonic(),
     )
 
-    return Reception(
-        server, inbox, deployment.ledger, allowed=registry.allows, certificates=registry.certificates_hash
-    )
+
+    def certificates(name: str) -> bytes | None:
+        found = registry.find(Role.ROBOT, name)
+        return None if found is None else found.hash
+
+    return Reception(server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates)
 
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:

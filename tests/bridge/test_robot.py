@@ -1,0 +1,157 @@
+"""The robot's loop on a spool whose disk is full or away, with a source that says what it is told to."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from rosbridge_eth import identity as ids
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
+from rosbridge_eth.channel import Client, ClientConfig, Message
+from rosbridge_eth.channel.udp import client_socket, server_sockets
+from rosbridge_eth.chunk import Log, drop, robot_id
+from rosbridge_eth.errors import StoreError
+from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
+from rosbridge_eth.sender import Sender
+from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.writer import LogWriter
+
+TOPIC = "/robot_1/odom"
+PLACE = Log(bytes(32), robot_id("robot_1"))
+NOW = datetime.now(UTC)
+
+
+class Source:
+    """Emits the sample bag's messages, over and over, `count` of them; `live` decides whether it could drop."""
+
+    kind, live = "bag", False
+
+    def __init__(self, count: int) -> None:
+        bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
+        self.messages, self.count, self.emitted = list(bag.messages()), count, 0
+        bag.close()
+        self.dropped: dict[str, int] = {}
+
+    def run(self, emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
+        while self.emitted < self.count and not stop.is_set():
+            emit(self.messages[self.emitted % len(self.messages)])
+            self.emitted += 1
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
+    """Robots with nobody at the other end."""
+    ca = ids.create_ca("operator", at=NOW)
+    who = ids.enrol(ca, ids.Role.ROBOT, "robot_1", at=NOW)
+    [nobody] = server_sockets(("127.0.0.1", 0))
+
+    def made(count: int) -> Robot:
+        now = time.monotonic()
+        spool = Spool(tmp_path / "spool.sqlite", PLACE, max_bytes=1 << 24, drop=partial(drop, PLACE, who.signing_key))
+        client = Client(ClientConfig(), who, ids.Trust((ca.certificate,)), "hub", now)
+        writer = LogWriter(PLACE, who.signing_key, [who.encryption_key.public_key], previous=bytes(32),
+                           stream_line=stream_line("bag", "test"), period=0.001, now=now)
+        socket, address = client_socket(nobody.getsockname()[:2])
+        client.connect(address, now)
+        return Robot(source=Source(count), capture=Capture([TopicRule(TOPIC)], source_kind="bag"), writer=writer,
+                     spool=spool, client=client, socket=socket, sender=Sender(client, spool))
+
+    yield made
+    nobody.close()
+
+
+def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = make(3 * RING)
+    append, full = robot.spool.append, [True]
+
+    def maybe(chunk: object) -> None:
+        if full[0]:
+            raise StoreError("the disk is full; make room")
+        append(chunk)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(robot.spool, "append", maybe)
+    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.01)
+    seen: list[int] = []
+    turns = 0
+
+    def on_turn() -> None:
+        nonlocal turns
+        turns += 1
+        if full[0] and len(robot._unspooled) >= MAX_UNSPOOLED:
+            seen.append(robot.captured)
+            full[0] = len(seen) < 50
+        if robot.captured == 3 * RING and not robot._unspooled:
+            robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert len(set(seen)) == 1 and seen[0] < 3 * RING, "nothing more is captured while nothing can be kept"
+    assert robot.captured == 3 * RING
+    assert "the spool: the disk is full" in caplog.text
+    assert "the spool: well again" in caplog.text
+    assert f"{robot.chunks} chunks kept for later" in robot.summary
+
+
+def test_a_spool_that_cannot_be_read_does_not_end_a_robot(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = make(100)
+
+    def away(*arguments: object) -> object:
+        raise StoreError("the disk is gone; mount it")
+
+    turns = 0
+
+    def on_turn() -> None:
+        nonlocal turns
+        turns += 1
+        if turns == 3:
+            monkeypatch.setattr(robot.spool, "statistics", away)
+            monkeypatch.setattr(robot.sender, "send", away)
+            monkeypatch.setattr(robot.sender, "handle", away)
+            robot.handle(Message(b"", b"", robot.client))  # type: ignore[arg-type]
+        if turns == 10:
+            robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert turns == 10
+    assert robot.summary == "the spool cannot be read"
+    assert "the disk is gone" in caplog.text
+
+
+def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: Callable[[int], Robot]) -> None:
+    robot = make(10)
+    run = robot.source.run
+
+    def breaks(emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
+        run(emit, stop)
+        raise OSError("the bag ends in the middle of a message")
+
+    robot.source.run = breaks  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="in the middle"):
+        robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
+    assert robot.captured == 10
+    assert "kept for later" in robot.summary
+
+
+def test_two_definitions_under_one_type_name_are_both_in_the_log(make: Callable[[int], Robot]) -> None:
+    robot = make(0)
+    first, other = robot.source.messages[0], robot.source.messages[1]  # type: ignore[attr-defined]
+    foreign = RawMessage(other.topic, other.type_name, other.received_ns, other.raw,
+                         type(other.decoder)(other.decoder.wire, other.decoder.definition))
+    names = [robot._definition(message) for message in (first, first, foreign, foreign, first)]
+    assert names[0] == names[1] != names[2] == names[3]
+    assert names[4] not in names[:4], "the first definition is said again before a message of it"
+    robot.spool.close()
+    robot.loop.close()
