@@ -11,7 +11,7 @@ type that doubles at every level, a fixed array that unrolls into too much code,
 (a count of 2**32 would cost no data), and a definition too long for a line of the log.
 
 The MSG format (wiki.ros.org/msg, "Interfaces" of the ROS 2 documentation) is read here, by a grammar of one line:
-rosbags' parser refuses names that ROS 1 allows. IDL is read by rosbags, behind `idl`.
+rosbags' parser refuses names that ROS 1 allows. IDL is rewritten in it by `idl`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from __future__ import annotations
 import hashlib
 import keyword
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, TypeAlias, cast
@@ -28,7 +28,7 @@ import orjson
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import BaseDesc, Fielddefs, FieldDesc, NameDesc, Typesdict
 
-from rosbridge_eth.capture.idl import parse_idl
+from rosbridge_eth.capture.idl import idl_as_msg
 from rosbridge_eth.errors import SourceError
 
 Format: TypeAlias = Literal["msg", "idl"]
@@ -147,10 +147,21 @@ def read_definition(type_name: str, text: str, format: Format = "msg") -> Defini
     name = normalised_type_name(type_name)
     if len(text) > MAX_TEXT:
         raise DefinitionError(f"the definition of {name} has {len(text)} characters; at most {MAX_TEXT} are read")
+    sections: Iterable[tuple[str, list[str]]]
     if format == "idl":
-        return check_types(name, _parse_idl(name, text))
-    lines = [kept for line in text.splitlines() if (kept := _without_comment(line))]
-    return check_types(name, _parse_msg(name, lines), "".join(f"{line}\n" for line in lines))
+        try:
+            kept, sections = None, idl_as_msg(text).items()
+        except ValueError as error:
+            raise DefinitionError(f"the IDL definition of {name} cannot be read: {error}") from None
+    else:
+        lines = [stripped for line in text.splitlines() if (stripped := _without_comment(line))]
+        kept, sections = "".join(f"{line}\n" for line in lines), _sections(name, lines)
+    types: dict[str, Fielddefs] = {}
+    for section, lines in sections:
+        fields = [field for line in lines if line != "@key" and (field := _parse_line(section, line))]
+        if types.setdefault(normalised_type_name(section), fields) != fields:
+            raise DefinitionError(f"message type {section} is defined twice, differently")
+    return check_types(name, types, kept)
 
 
 def check_types(type_name: str, types: Mapping[str, Fielddefs], text: str | None = None) -> Definition:
@@ -325,19 +336,6 @@ def _sections(type_name: str, lines: list[str]) -> Iterator[tuple[str, list[str]
     yield section, kept
 
 
-def _parse_msg(type_name: str, lines: list[str]) -> dict[str, Fielddefs]:
-    types: dict[str, Fielddefs] = {}
-    for section, kept in _sections(type_name, lines):
-        found = (_parse_line(section, line) for line in kept if line != "@key")
-        _add(types, section, [field for field in found if field is not None])
-    return types
-
-
-def _add(types: dict[str, Fielddefs], name: str, fields: Fielddefs) -> None:
-    if types.setdefault(name, fields) != fields:
-        raise DefinitionError(f"message type {name} is defined twice, differently")
-
-
 def _parse_line(owner: str, line: str) -> tuple[str, FieldDesc] | None:
     """One field, or None for a constant."""
     match = _LINE.fullmatch(line)
@@ -369,19 +367,6 @@ def _full_name(owner: str, name: str) -> str:
     if name in _SHORT_NAMES:
         return _SHORT_NAMES[name]
     return normalised_type_name(name if "/" in name else f"{owner.rpartition('/')[0]}/{name}")
-
-
-def _parse_idl(type_name: str, text: str) -> dict[str, Fielddefs]:
-    def error(reason: str) -> DefinitionError:
-        return DefinitionError(f"the IDL definition of {type_name} cannot be read: {_shown(reason)}")
-
-    # As mcap stores it: every type after a line of 80 "=" and `IDL: pkg/msg/Name`; or one text alone.
-    sections = re.split(rf"^{_SEPARATOR}\r?\n(?:IDL: [^\n]*\n)?", text, flags=re.MULTILINE)
-    types: dict[str, Fielddefs] = {}
-    for section in sections:
-        for name, fields in parse_idl(section, error).items():
-            _add(types, normalised_type_name(name), fields)
-    return types
 
 
 def _md5_of_one(owner: str, lines: list[str], sums: Mapping[str, str]) -> str:

@@ -1,126 +1,104 @@
-"""IDL definitions, as far as ROS 2 messages use it, by rosbags' parser, which is given only what it reads quickly.
+"""IDL definitions, as far as ROS 2 messages use it (OMG IDL 4.2, 7.4), rewritten in the MSG format.
 
-rosbags' parser takes time exponential in nested parentheses and sequences, evaluates shifts of any size and recurses.
-So the text is first reduced to plain declarations (OMG IDL 4.2, 7.4): comments and annotations go, a constant keeps
-its value only where that is a plain number, as which it may be a bound, and any expression, deep nesting or endless
-list is refused.
+    module pkg { module msg {
+      typedef double double__36[36];                         pkg/msg/Name:
+      const long LIMIT = 7;
+      struct Name {
+        double__36 covariance;                                 float64[36] covariance
+        sequence<string<5>, LIMIT> names;                      string<=5[<=7] names
+        other::msg::Part a, b[2];                              other/msg/Part a, other/msg/Part[2] b
+      };
+    }; };
+
+Comments, annotations and preprocessor lines are left out; a constant is known where it is a plain number. Unions, enums
+and expressions are refused here; what MSG has no form for (arrays of arrays, unknown bounds) makes a line that is
+refused there. Nothing recurses, and the expressions below match in linear time: rosbags' parser needs exponential time
+for nested parentheses and sequences, and computes shifts of any size.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
-from rosbags.interfaces.typing import Fielddefs
-from rosbags.typesys import TypesysError, get_types_from_idl
-
-_TOKEN = re.compile(
-    r"""(?P<skipped>\s+|//[^\n]*|/\*.*?\*/|\#[^\n]*)|[A-Za-z][A-Za-z0-9_]*|::|[0-9][A-Za-z0-9.+]*"""
-    r"""|"(?:[^"\\\n]|\\.)*"|'(?:[^'\\\n]|\\.)*'|[^\w\s"']""",
-    re.ASCII | re.DOTALL,
+_STRING = r""" "(?:[^"\\\n]|\\.)*+" | '(?:[^'\\\n]|\\.)*+' """
+_ID = r"[A-Za-z][A-Za-z0-9_]*+"
+_SCOPED = rf"(?:::)?+{_ID}(?:::{_ID})*+"
+_BOUND = rf"(?:[0-9]{{1,10}}|{_SCOPED})"
+# Of a file that has several: a line of 80 "=" before each. A comment that does not end goes on to the end of the text.
+_SKIPPED = re.compile(
+    rf"""^={{80}}\r?\n(?:IDL:[^\n]*+)? | //[^\n]*+ | /\*.*?(?:\*/|\Z) | \#[^\n]*+
+       | @\s*+{_SCOPED}\s*+(?:\((?:{_STRING}|[^"'()])*+\))? | {_STRING}""",
+    re.ASCII | re.DOTALL | re.MULTILINE | re.VERBOSE,
 )
-_INTEGER = re.compile(r"[0-9]{1,10}", re.ASCII)
-_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_]*|[0-9]{1,10}|::|[;,<>{}\[\]=]", re.ASCII)
-_CLOSING = {"}": "{", "]": "[", ">": "<"}
-_MAX_TOKENS = 1 << 14
-_MAX_NESTING = 16
-_MAX_SCOPES = 8
-_MAX_BOUNDS = 128
-"""Lengths of arrays, sequences and strings: rosbags' parser takes up to ten milliseconds for each."""
-
-MakeError = Callable[[str], Exception]
-
-
-def parse_idl(text: str, error: MakeError) -> dict[str, Fielddefs]:
-    """The structs of the text, in rosbags' tree form, not checked. `error` makes the exception of a reason."""
-    tokens = list(_without_constants(iter(_without_annotations(_tokens(text, error), error)), error))
-    if not tokens:
-        return {}
-    _check(tokens, error)
-    try:
-        types = get_types_from_idl(" ".join(tokens).replace(" :: ", "::"))
-    except (TypesysError, ValueError, KeyError, AssertionError, RecursionError) as reason:
-        # rosbags quotes the whole text first; what it expected stands at the end.
-        raise error(str(reason).rpartition("\n")[2] or type(reason).__name__) from None
-    if len(types) != tokens.count("struct"):
-        raise error("a struct is defined twice")
-    return {name: fields for name, (_, fields) in types.items()}
+# The others are for text without superfluous spaces.
+_SCOPE = re.compile(rf"(module|struct) ({_ID})", re.ASCII)
+_CONSTANT = re.compile(rf"const [A-Za-z][\w:<> ]* ({_ID}) ?= ?(?:([0-9]{{1,10}})|.*)", re.ASCII)
+_DECLARATION = re.compile(
+    rf"""(?P<sequence>sequence\ ?<\ ?)?
+    (?P<type>unsigned\ (?:short|long\ long|long)\b|long\ (?:long|double)\b|{_SCOPED})
+    (?:\ ?<\ ?(?P<length>{_BOUND})\ ?>)?
+    (?(sequence)\ ?(?:,\ ?(?P<bound>{_BOUND})\ ?)?>)
+    \ ?\b(?P<names>[^<>]+)""",
+    re.ASCII | re.VERBOSE,
+)
+_DECLARATOR = re.compile(rf" ?({_ID}) ?(?:\[ ?({_BOUND}) ?\])? ?", re.ASCII)
+_BASES = {
+    "boolean": "bool", "octet": "byte", "float": "float32", "double": "float64", "long double": "float128",
+    "short": "int16", "unsigned short": "uint16", "long": "int32", "unsigned long": "uint32", "long long": "int64",
+    "unsigned long long": "uint64",
+} | {name: name for name in (
+    "char", "wchar", "string", "wstring", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
+)}  # fmt: skip
 
 
-def _tokens(text: str, error: MakeError) -> list[str]:
-    tokens: list[str] = []
-    position = 0
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if match is None or (text.startswith("/*", match.start()) and match["skipped"] is None):
-            raise error(f"{text[position : position + 20]!r} is not IDL")
-        position = match.end()
-        if match["skipped"] is None:
-            tokens.append(match[0])
-    return tokens
+def idl_as_msg(text: str) -> dict[str, list[str]]:
+    """Of each struct, its fields as lines in the MSG format. Raises ValueError with a reason."""
+    structs: dict[str, list[str]] = {}
+    known: dict[str, str] = {}  # typedefs and constants by their full names, as MSG writes them
+    scope: list[str] = []
+    *statements, rest = re.split("([;{}])", " ".join(_SKIPPED.sub(" ", text).split()))
+    for statement, end in zip(statements[::2], statements[1::2], strict=True):
+        head, inside = statement.strip(), "/".join(scope)
+        if end == "{" and (match := _SCOPE.fullmatch(head)) and inside not in structs and len(scope) < 8:
+            scope.append(match[2])
+            if match[1] == "struct" and structs.setdefault("/".join(scope), []):
+                raise ValueError(f"struct {match[2]} is defined twice")
+        elif end == "}" and not head and scope:
+            scope.pop()
+        elif end == ";" and (match := _CONSTANT.fullmatch(head)):
+            known["::".join([*scope, match[1]])] = match[2] or "unknown"
+        elif end == ";" and head.startswith("typedef "):
+            known |= {"::".join([*scope, name]): kind for kind, name in _declared(head[8:], scope, known)}
+        elif end == ";" and head and inside in structs:
+            structs[inside] += [f"{kind} {name}" for kind, name in _declared(head, scope, known)]
+        elif head or end != ";":
+            raise ValueError(f"{head[:40] + end!r} is not supported in a message")
+    if rest.strip() or scope:
+        raise ValueError("it ends within a declaration")
+    return structs
 
 
-def _without_annotations(tokens: list[str], error: MakeError) -> list[str]:
-    """`@name(...)` goes; whatever else has parentheses is refused later."""
-    kept: list[str] = []
-    position = 0
-    while position < len(tokens):
-        if tokens[position] != "@":
-            kept.append(tokens[position])
-            position += 1
-            continue
-        position += 2
-        while tokens[position : position + 1] == ["::"]:
-            position += 2
-        depth = 0
-        while tokens[position : position + 1] == ["("] or depth:
-            if position >= len(tokens):
-                raise error("an annotation does not end")
-            depth += (tokens[position] == "(") - (tokens[position] == ")")
-            position += 1
-            if not depth:
-                break
-    return kept
+def _declared(text: str, scope: list[str], known: dict[str, str]) -> Iterator[tuple[str, str]]:
+    """Type, as MSG writes it, and name of all that a declaration declares."""
 
+    def resolved(name: str, otherwise: str) -> str:
+        """What is known by that name, in the nearest scope."""
+        names = ("::".join([*scope[:depth], name.removeprefix("::")]) for depth in range(len(scope), -1, -1))
+        return next((known[full] for full in names if full in known), otherwise)
 
-def _without_constants(tokens: Iterator[str], error: MakeError) -> Iterator[str]:
-    """A constant becomes a number; 0 if it is not a plain one, which no bound may be."""
-    for token in tokens:
-        if token != "const":  # noqa: S105 - a keyword of IDL
-            yield token
-            continue
-        declaration: list[str] = []
-        while not declaration or declaration[-1] != ";":
-            try:
-                declaration.append(next(tokens))
-            except StopIteration:
-                raise error("a constant does not end") from None
-        if "=" not in declaration[1:]:
-            raise error("a constant has no value")
-        name, value = declaration[declaration.index("=", 1) - 1], declaration[-2]
-        plain = declaration[-3] == "=" and _INTEGER.fullmatch(value)
-        yield from ("const", "long", name, "=", value.lstrip("0") or "0" if plain else "0", ";")
-
-
-def _check(tokens: list[str], error: MakeError) -> None:
-    """Nothing that rosbags' parser takes long for, or recurses in."""
-    if len(tokens) > _MAX_TOKENS:
-        raise error("it is too long")
-    opened: list[str] = []
-    scopes = bounds = 0
-    for before, token in zip(["", *tokens], tokens, strict=False):
-        if not _PLAIN.fullmatch(token):
-            raise error(f"{token!r} is not supported in a message")
-        scopes = scopes + 1 if token == "::" else scopes if before == "::" else 0  # noqa: S105 - a sign
-        if scopes > _MAX_SCOPES or len(opened) > _MAX_NESTING:
-            raise error("it is nested too deeply")
-        in_sequence = opened[-1:] == ["<"]
-        if token == "sequence" and in_sequence:  # noqa: S105 - a keyword of IDL
-            raise error("a sequence of sequences is not supported")
-        bounds += token == "[" or (token == "<" and before != "sequence") or (token == "," and in_sequence)  # noqa: S105
-        if bounds > _MAX_BOUNDS:
-            raise error("it has too many bounds")
-        if token in "{[<":  # noqa: S105 - signs
-            opened.append(token)
-        elif token in _CLOSING and (not opened or opened.pop() != _CLOSING[token]):
-            raise error(f"{token!r} closes nothing")
+    match = _DECLARATION.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text[:40]!r} is not a type and a name")
+    kind, length, bound = match["type"], match["length"], match["bound"]
+    parts = kind.removeprefix("::").split("::")
+    kind = _BASES.get(kind) or resolved(kind, "/".join(parts if len(parts) > 1 else [*scope[:2], *parts]))
+    if length:
+        kind += f"<={resolved(length, length)}"
+    if match["sequence"]:
+        kind += f"[<={resolved(bound, bound)}]" if bound else "[]"
+    for declarator in match["names"].split(","):
+        part = _DECLARATOR.fullmatch(declarator)
+        if part is None:
+            raise ValueError(f"{declarator[:40]!r} is not a name")
+        yield f"{kind}[{resolved(part[2], part[2])}]" if part[2] else kind, part[1]

@@ -414,7 +414,6 @@ def test_idl_as_rosidl_generates_it():
         "module pkg { module msg { struct T { " + "a::" * 5000 + "b x; }; }; };",
         "module pkg { module msg { " + "".join(f"typedef T{n + 1} T{n};" for n in range(2000)) + "struct T { T0 x; };",
         "module pkg { module msg { struct T { " + "sequence<long, 4> x; " * 3000 + "}; }; };",
-        "module pkg { module msg { struct T { " + " ".join(f"string<5> x{n};" for n in range(900)) + "}; }; };",
         "module pkg { module msg { " + "const long A = 1;" * 2000 + "struct T { " + "long x[A];" * 1000 + "}; }; };",
         "struct T { long x; }; " * 3000,
         "const",
@@ -425,7 +424,7 @@ def test_idl_as_rosidl_generates_it():
         "#" * 200_000 + "\n'",
         "// " * 60_000 + "\n@",
     ],
-    ids=range(36),
+    ids=range(35),
 )
 @pytest.mark.timeout(10)
 def test_hostile_idl_is_refused_quickly(text):
@@ -447,6 +446,14 @@ def test_any_arrangement_of_idl_is_a_definition_or_an_error(text, wrapped):
         text = f"module pkg {{ module msg {{ struct T {{ {text} }}; }}; }};"
     with contextlib.suppress(DefinitionError):
         read_definition("pkg/T", text, "idl")
+
+
+@pytest.mark.timeout(10)
+def test_many_bounds_in_idl_are_read_quickly():
+    text = f"module pkg {{ module msg {{ struct T {{ {' '.join(f'string<5> x{n};' for n in range(900))} }}; }}; }};"
+    started = time.process_time()
+    assert len(read_definition("pkg/T", text, "idl").fields["pkg/msg/T"]) == 900
+    assert time.process_time() - started < 4
 
 
 @pytest.mark.timeout(10)
