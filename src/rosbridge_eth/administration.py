@@ -27,7 +27,7 @@ from rosbridge_eth.chunk import MAX_READERS, robot_id
 from rosbridge_eth.config import Address, ServerConfig, load_server_config, parse_config
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
-from rosbridge_eth.files import require_private, write_atomically
+from rosbridge_eth.files import read_private, write_atomically
 from rosbridge_eth.home import (
     BridgeEnd,
     Deployment,
@@ -204,13 +204,13 @@ def change_passphrase(path: Path, old: bytes, new: bytes) -> list[Path]:
     if (accounts := OperatorHome(path).accounts).exists():
         files.append(accounts)
     for file in files:
-        require_private(file)
+        content = read_private(file)
         for passphrase in (old, new):  # what an attempt that was cut short wrote is under the new one
             with suppress(InvalidKey, IdentityError):
                 if file == accounts:
-                    changed[file] = Keyring.load(file, passphrase).seal(new)
+                    changed[file] = Keyring.open(content, passphrase).seal(new)
                 else:
-                    changed[file] = sm2.PrivateKey.from_pem(file.read_bytes(), passphrase).to_pem(new)
+                    changed[file] = sm2.PrivateKey.from_pem(content, passphrase).to_pem(new)
                 break
         else:
             raise IdentityError(f"{file} does not open under this passphrase")

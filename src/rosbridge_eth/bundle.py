@@ -14,19 +14,11 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from rosbridge_eth import identity as ids
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
 from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, require_empty
-from rosbridge_eth.identity import (
-    KEY_FILES,
-    Role,
-    Trust,
-    check_name,
-    identity_from_files,
-    public_identity,
-    read_certificates,
-    requests,
-)
+from rosbridge_eth.identity import KEY_FILES, check_name
 from smcrypto import SMCryptoError, sm2, x509
 
 FIRST_CONFIG = """\
@@ -46,7 +38,7 @@ class Request:
 
     @staticmethod
     def make(name: str, signing_key: sm2.PrivateKey, encryption_key: sm2.PrivateKey) -> Request:
-        return Request(name, *requests(name, signing_key, encryption_key))
+        return Request(name, *ids.requests(name, signing_key, encryption_key))
 
     def encode(self) -> bytes:
         signing, encryption = self.signing.to_pem().decode(), self.encryption.to_pem().decode()
@@ -111,14 +103,12 @@ def ask_to_join(home: RobotHome, name: str, password: bytes) -> Request:
     """Make a robot's home with keys of its own, and the request that the operator answers with a bundle."""
     check_name(name)
     require_empty(home.path)
-    home.identity.mkdir(mode=0o700, parents=True, exist_ok=True)
-    home.path.chmod(0o700)
+    _make_folders(home)
     keys = [sm2.PrivateKey.generate() for _ in KEY_FILES]
     for file, key in zip(KEY_FILES, keys, strict=True):
         write_atomically(home.identity / file, key.to_pem(password), mode=0o600)
     request = Request.make(name, *keys)
     write_atomically(home.request, request.encode())
-    write_atomically(home.config, FIRST_CONFIG.encode())
     make_home(home.path, HomeKind.ROBOT, name=name)
     return request
 
@@ -129,43 +119,48 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     The CA's fingerprint (SM3 of its certificate, hex), which is to be compared with the operator's: who could change
     the bundle on its way could have put another there. A home may join again where its keys were certified anew.
     """
-    files = {name: content.encode() for name, content in bundle.certificates.items()}
+    files = {name: content.encode() for name, content in {**bundle.certificates, **bundle.keys}.items()}
+    peer = ids.public_identity(b"".join(files.get(name, b"") for name in ("sign.crt.pem", "enc.crt.pem")))
     if bundle.keys:
         require_empty(home.path)
-        files |= {name: content.encode() for name, content in bundle.keys.items()}
-        identity_from_files(files, password)  # refuse what could not be used before anything is written
+        ids.identity_from_files(files, password)  # refuse what could not be used before anything is written
     else:
-        home_of(
-            home.path, HomeKind.ROBOT,
-            "this bundle answers the request of a robot that made its own keys: join in that robot's home",
-        )
-        if not home.request.exists():
-            raise IdentityError(f"{home.path} has made no request that this bundle could answer; join in a new folder")
-    peer = public_identity(b"".join(files.get(name, b"") for name in ("sign.crt.pem", "enc.crt.pem")))
-    if not bundle.keys:
-        request = Request.decode(home.request.read_bytes())
-        ours = (request.name, request.signing.public_key, request.encryption.public_key)
-        theirs = (peer.name, peer.signing_certificate.public_key, peer.encryption_certificate.public_key)
-        if ours != theirs:
-            raise IdentityError(f"this bundle answers another request than {home.request}: it is for other keys")
-    roots = read_certificates(files.get("ca.crt.pem", b""))
+        _require_answer(home, peer)
+    roots = ids.read_certificates(files.get("ca.crt.pem", b""))
     # At a time when they hold: a robot's clock may begin in 1970.
-    Trust(roots).check(
-        peer.signing_certificate.to_der(), peer.encryption_certificate.to_der(), role=Role.ROBOT, name=bundle.end.robot,
-        at=peer.not_before,
-    )
+    ids.Trust(roots).check(
+        peer.signing_certificate.to_der(), peer.encryption_certificate.to_der(), role=ids.Role.ROBOT,
+        name=bundle.end.robot, at=peer.not_before,
+    )  # fmt: skip
     if home.bridge_file.exists() and home.bridge().ledger != bundle.end.ledger:
         raise ConfigError(f"{home.path} writes to another ledger already; choose another folder")
-    for folder in (home.identity, home.readers):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    home.path.chmod(0o700)
+    _make_folders(home)
     for name, content in files.items():
         write_atomically(home.identity / name, content, mode=0o600 if name in KEY_FILES else 0o644)
     for name, pem in bundle.readers.items():
         write_atomically(home.readers / f"{name}.pem", pem.encode())
-    if not home.config.exists():
-        write_atomically(home.config, FIRST_CONFIG.encode())
     home.raise_clock_floor(peer.not_before.timestamp())
     home.save_bridge(bundle.end)
     make_home(home.path, HomeKind.ROBOT, name=bundle.end.robot)
     return roots[0].fingerprint().hex()
+
+
+def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:
+    """Return if the certificates are for the keys of this home's request."""
+    mend = "this bundle answers the request of a robot that made its own keys: join in that robot's home"
+    home_of(home.path, HomeKind.ROBOT, mend)
+    if not home.request.exists():
+        raise IdentityError(f"{home.path} has made no request that this bundle could answer; join in a new folder")
+    request = Request.decode(home.request.read_bytes())
+    ours = (request.name, request.signing.public_key, request.encryption.public_key)
+    if ours != (peer.name, peer.signing_certificate.public_key, peer.encryption_certificate.public_key):
+        raise IdentityError(f"this bundle answers another request than {home.request}: it is for other keys")
+
+
+def _make_folders(home: RobotHome) -> None:
+    """The folders of a robot's home, and the configuration that it begins with."""
+    for folder in (home.path, home.identity, home.readers):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    home.path.chmod(0o700)
+    if not home.config.exists():
+        write_atomically(home.config, FIRST_CONFIG.encode())

@@ -43,28 +43,20 @@ def write_atomically(path: Path, content: bytes, *, mode: int = 0o644, new: bool
             stream.flush()
             os.fsync(stream.fileno())
         os.chmod(temporary, mode)
-        if new:
-            os.link(temporary, path)
-        else:
-            os.replace(temporary, path)
-        _keep_name(path.parent)
+        (os.link if new else os.replace)(temporary, path)
+        folder = os.open(path.parent, os.O_RDONLY)  # a file's name is on the disk when its folder is
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     finally:
         Path(temporary).unlink(missing_ok=True)
 
 
-def _keep_name(folder: Path) -> None:
-    """A file's name is on the disk when its folder is."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def read_private(path: Path) -> bytes:
+    """The content of a file that holds a secret; IdentityError where others may read it, or it cannot be read."""
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def require_private(path: Path) -> None:
-    """Return if nobody but its owner can read or write the file; else IdentityError."""
-    try:
-        mode = stat.S_IMODE(path.stat().st_mode)
+        mode, content = stat.S_IMODE(path.stat().st_mode), path.read_bytes()
     except OSError as error:
         raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
     if mode & 0o077:
@@ -72,15 +64,7 @@ def require_private(path: Path) -> None:
             f"{path} is open to others (mode {mode:04o}); run `chmod 600 {path}`, and if it may have been read,"
             " make its keys anew"
         )
-
-
-def read_private(path: Path) -> bytes:
-    """The content of a file that holds a secret; IdentityError where others may read it, or it cannot be read."""
-    require_private(path)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
+    return content
 
 
 def seal_box(secret: bytes, password: bytes, head: Mapping[str, Any], *, n: int = SCRYPT_N) -> bytes:

@@ -35,6 +35,7 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -42,7 +43,7 @@ from typing import Any, TypeVar
 
 from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError
-from rosbridge_eth.files import write_atomically as write_atomically
+from rosbridge_eth.files import write_atomically
 
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
 _FORMAT = "rosbridge-eth home 2"
@@ -99,28 +100,22 @@ class BridgeEnd:
 
 # JSON files
 
-_Document = TypeVar("_Document", Deployment, BridgeEnd)
+_Document = TypeVar("_Document")
+
 
 def _save(path: Path, value: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(value, indent=1).encode() + b"\n")
 
 
-def _load(path: Path, mend: str, absent: BridgeError) -> dict[str, Any]:
-    """The object in a file. ConfigError with the way out where it is none; `absent` where there is no file."""
+def _load(form: Callable[..., _Document], path: Path, mend: str, absent: BridgeError) -> _Document:
+    """What is made of the object in a file. ConfigError with the way out where it is none; `absent` without a file."""
     try:
-        return dict(json.loads(path.read_bytes()))
+        return form(**json.loads(path.read_bytes()))
     except FileNotFoundError:
         raise absent from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}); {mend}") from error
-
-
-def _read(form: type[_Document], path: Path, mend: str, absent: BridgeError) -> _Document:
-    try:
-        return form(**_load(path, mend, absent))
-    except TypeError as error:
         raise ConfigError(f"{path} is damaged ({error}); {mend}") from error
 
 
@@ -140,7 +135,7 @@ def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[st
         f"{path} is nobody's home; `init --home` makes an operator's, `join` a robot's, `reader NAME` a reader's"
         if kind is None else f"{path} is not {_WHOSE[kind]} home; {mend}"
     )
-    head = _load(path / "home.json", "restore it from your backup", nobodys)
+    head = _load(dict[str, Any], path / "home.json", "restore it from your backup", nobodys)
     if head.get("format") != _FORMAT or head.get("kind") not in HomeKind.__members__.values():
         raise ConfigError(f"{path} was made by another version of this program; use that one, or make a new home")
     if kind is not None and head["kind"] != kind:
@@ -188,7 +183,7 @@ class OperatorHome:
         """The operator's account on the chain, which accounts.json shows in the clear."""
         mend = "restore it from your backup"
         absent = ConfigError(f"{self.accounts} is missing; {mend}")
-        return str(_load(self.accounts, mend, absent).get("operator"))
+        return str(_load(dict[str, Any], self.accounts, mend, absent).get("operator"))
 
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""
@@ -201,7 +196,7 @@ class OperatorHome:
     def deployment(self) -> Deployment:
         """ChainError where no contract is deployed yet."""
         absent = ChainError(f"no contract is deployed yet; run `deploy --home {self.path}`")
-        return _read(Deployment, self.deployment_file, "restore it from your backup", absent)
+        return _load(Deployment, self.deployment_file, "restore it from your backup", absent)
 
 
 class RobotHome:
@@ -227,7 +222,7 @@ class RobotHome:
             f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
             f" a bundle, and run here `join BUNDLE --home {self.path}`"
         )
-        return _read(BridgeEnd, self.bridge_file, "join again", absent)
+        return _load(BridgeEnd, self.bridge_file, "join again", absent)
 
     def clock_floor(self) -> float:
         """The latest time (seconds since 1970) a server proved to this robot; 0 where there is none."""

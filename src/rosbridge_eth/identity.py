@@ -15,7 +15,7 @@ Not here: how certificates travel (channel), what is encrypted to whom (sealing)
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -28,7 +28,7 @@ from smcrypto import CertificateError, InvalidKey, InvalidSignature, SMCryptoErr
 SIGNATURE_SIZE = 64
 """Bytes of a signature: r ‖ s, GB/T 32918.2."""
 
-URI_PREFIX = "urn:rosbridge-eth:"
+URI_PREFIX = "URI:urn:rosbridge-eth:"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
 _PURPOSE = re.compile(r"[a-z][a-z-]*\Z")
 
@@ -82,11 +82,6 @@ def check_name(name: str) -> str:
     return name
 
 
-def uri(role: Role, name: str) -> str:
-    """The subject alternative name of an identity."""
-    return f"{URI_PREFIX}{Role(role)}:{check_name(name)}"
-
-
 def _extended_key_usage(role: Role) -> str:
     return "serverAuth" if role is Role.SERVER else "clientAuth"
 
@@ -125,23 +120,16 @@ class PeerIdentity:
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """One's own two key pairs and their certificates. Its repr shows no key."""
+class Identity(PeerIdentity):
+    """One's own: with the keys of both certificates. Its repr shows no key."""
 
-    role: Role
-    name: str
     signing_key: sm2.PrivateKey = field(repr=False)
-    signing_certificate: x509.Certificate = field(repr=False)
     encryption_key: sm2.PrivateKey = field(repr=False)
-    encryption_certificate: x509.Certificate = field(repr=False)
 
     @property
     def public(self) -> PeerIdentity:
         """What others may know of it."""
         return PeerIdentity(self.role, self.name, self.signing_certificate, self.encryption_certificate)
-
-    def __str__(self) -> str:
-        return f"{self.role} {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,20 +165,21 @@ def verify(public_key: sm2.PublicKey, purpose: str, body: bytes, signature: byte
 
 
 def _holder(certificate: x509.Certificate) -> tuple[Role, str]:
-    names = [name for name in certificate.subject_alt_names if name.startswith("URI:" + URI_PREFIX)]
-    if len(names) != 1 or len(certificate.subject_alt_names) != 1:
+    names = certificate.subject_alt_names
+    if len(names) != 1 or not names[0].startswith(URI_PREFIX):
         raise UntrustedCertificate(f"a certificate must carry exactly one name, {URI_PREFIX}ROLE:NAME")
-    role, _, name = names[0].removeprefix("URI:" + URI_PREFIX).partition(":")
+    role, _, name = names[0].removeprefix(URI_PREFIX).partition(":")
     if role not in Role.__members__.values() or not _NAME.match(name):
         raise UntrustedCertificate(f"{names[0]!r} names no role and name that exist here")
     return Role(role), name
 
 
-def _apart(signing: Collection[str] | None, encryption: Collection[str] | None) -> bool:
-    """Whether both certificates say what they are for, and not the same."""
-    if signing is None or encryption is None:
-        return False
-    return not set(ENCRYPTION_USAGE) & set(signing) and not set(SIGNING_USAGE) & set(encryption)
+def _pair(signing: x509.Certificate, encryption: x509.Certificate) -> PeerIdentity:
+    """Whom two certificates name; UntrustedCertificate if they are not of one identity."""
+    holder = _holder(signing)
+    if _holder(encryption) != holder:
+        raise UntrustedCertificate("the signing and the encryption certificate are of two identities")
+    return PeerIdentity(*holder, signing, encryption)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,46 +196,34 @@ class Trust:
     def check(
         self, signing_der: bytes, encryption_der: bytes, *, role: Role | Iterable[Role], name: str | None = None,
         at: datetime,
-    ) -> PeerIdentity:
+    ) -> PeerIdentity:  # fmt: skip
         """Who the two certificates (DER) say they are, if all of it holds at `at` (aware UTC).
 
         role: the one expected, or several; name: None for any. Raises a
         subclass of UntrustedCertificate that tells why. Costs two or more
-        signature verifications; `examine` and `permit` are its two halves.
+        signature verifications.
         """
-        peer = self.examine(signing_der, encryption_der, at=at)
-        self.permit(peer, role=role, name=name, at=at)
-        return peer
-
-    def examine(self, signing_der: bytes, encryption_der: bytes, *, at: datetime) -> PeerIdentity:
-        """The costly half of `check`: the chains, the uses, and that both certificates are of one identity."""
         try:
-            signing = x509.Certificate.from_der(signing_der)
-            encryption = x509.Certificate.from_der(encryption_der)
-            holder, other = _holder(signing), _holder(encryption)
+            peer = _pair(x509.Certificate.from_der(signing_der), x509.Certificate.from_der(encryption_der))
         except (CertificateError, InvalidKey) as error:
             raise UntrustedCertificate(f"a certificate cannot be read: {error}") from error
-        if holder != other:
-            raise UntrustedCertificate("the signing and the encryption certificate are of two identities")
-        peer = PeerIdentity(*holder, signing, encryption)
-        self._check_validity(peer, at)
-        for certificate, usage in ((signing, ("digitalSignature",)), (encryption, ("keyAgreement",))):
+        if not peer.not_before <= at <= peer.not_after:
+            raise ExpiredCertificate(
+                f"the certificate of {peer} is valid from {peer.not_before} to {peer.not_after}, not at {at}"
+            )
+        for certificate, use, other in (
+            (peer.signing_certificate, "digitalSignature", ENCRYPTION_USAGE),
+            (peer.encryption_certificate, "keyAgreement", SIGNING_USAGE),
+        ):
             try:
                 x509.verify_chain(
-                    certificate, roots=self.roots, at=at, key_usage=usage,
+                    certificate, roots=self.roots, at=at, key_usage=(use,),
                     extended_key_usage=_extended_key_usage(peer.role),
-                )
+                )  # fmt: skip
             except CertificateError as error:
                 raise UntrustedCertificate(f"the certificate of {peer} is not to be trusted: {error}") from error
-        if not _apart(signing.key_usage, encryption.key_usage):
-            raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
-        return peer
-
-    def permit(
-        self, peer: PeerIdentity, *, role: Role | Iterable[Role], name: str | None = None, at: datetime
-    ) -> None:
-        """The cheap half of `check`, for certificates that were examined before: validity, role, name, list."""
-        self._check_validity(peer, at)
+            if certificate.key_usage is None or set(other) & set(certificate.key_usage):
+                raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
         roles = (role,) if isinstance(role, Role) else tuple(role)
         if peer.role not in roles:
             raise WrongRole(f"{peer} was met where a {' or '.join(roles)} is expected")
@@ -254,13 +231,7 @@ class Trust:
             raise WrongName(f"{peer} was met where {name} is expected")
         if self.allowed is not None and not self.allowed(peer):
             raise NotAllowed(f"{peer} is not on the allow list")
-
-    @staticmethod
-    def _check_validity(peer: PeerIdentity, at: datetime) -> None:
-        if not peer.not_before <= at <= peer.not_after:
-            raise ExpiredCertificate(
-                f"the certificate of {peer} is valid from {peer.not_before} to {peer.not_after}, not at {at}"
-            )
+        return peer
 
 
 # Creating identities
@@ -280,42 +251,35 @@ def load_ca(folder: Path, password: bytes, at: datetime) -> CertificateAuthority
 
     IdentityError where the key does not open, is another's, or the certificate is no CA's or not valid at `at`.
     """
-    key_file, certificate_file = folder / "ca.key.pem", folder / "ca.crt.pem"
+    certificate = read_certificates(_read(folder / "ca.crt.pem"))[0]
     try:
-        certificate = read_certificates(certificate_file.read_bytes())[0]
-    except OSError as error:
-        raise IdentityError(f"{certificate_file} cannot be read: {error.strerror}") from error
-    try:
-        key = sm2.PrivateKey.from_pem(read_private(key_file), password=password)
+        key = sm2.PrivateKey.from_pem(read_private(folder / "ca.key.pem"), password=password)
     except InvalidKey as error:
-        raise IdentityError(f"{key_file} does not open under this passphrase") from error
+        raise IdentityError(f"{folder / 'ca.key.pem'} does not open under this passphrase") from error
+    usage, life = certificate.key_usage, (certificate.not_before, certificate.not_after)
     if key.public_key != certificate.public_key:
-        raise IdentityError(f"{key_file} is not the key of {certificate_file}")
-    usage = certificate.key_usage
+        raise IdentityError(f"{folder / 'ca.key.pem'} is not the key of {folder / 'ca.crt.pem'}")
     if not certificate.is_ca or (usage is not None and "keyCertSign" not in usage):
-        raise IdentityError(f"{certificate_file} is not a CA's certificate: it may not issue others")
-    if not certificate.not_before <= at <= certificate.not_after:
-        raise IdentityError(
-            f"{certificate_file} is valid from {certificate.not_before} to {certificate.not_after}, not at {at}"
-        )
+        raise IdentityError(f"{folder / 'ca.crt.pem'} is not a CA's certificate: it may not issue others")
+    if not life[0] <= at <= life[1]:
+        raise IdentityError(f"{folder / 'ca.crt.pem'} is valid from {life[0]} to {life[1]}, not at {at}")
     return CertificateAuthority(key, certificate)
 
 
 def requests(
-    name: str, signing_key: sm2.PrivateKey, encryption_key: sm2.PrivateKey
+    name: str, *keys: sm2.PrivateKey
 ) -> tuple[x509.CertificateSigningRequest, x509.CertificateSigningRequest]:
-    """The two certificate requests (signing, encryption) of keys that never leave their machine."""
-    subject = {"CN": check_name(name)}
-    return (
-        x509.CertificateSigningRequest.create(signing_key, subject=subject),
-        x509.CertificateSigningRequest.create(encryption_key, subject=subject),
+    """The two certificate requests of a signing and an encryption key that never leave their machine."""
+    signing, encryption = (
+        x509.CertificateSigningRequest.create(key, subject={"CN": check_name(name)}) for key in keys
     )
+    return signing, encryption
 
 
 def enrol_requests(
     ca: CertificateAuthority, role: Role, name: str, signing_request: x509.CertificateSigningRequest,
     encryption_request: x509.CertificateSigningRequest, *, at: datetime,
-) -> PeerIdentity:
+) -> PeerIdentity:  # fmt: skip
     """Certificates for `role` and `name` over the keys of two requests; they begin a day before `at`.
 
     Role, name, uses and validity are the CA's to say; of a request only the
@@ -327,32 +291,24 @@ def enrol_requests(
             request.verify()
         except SMCryptoError as error:
             raise IdentityError(f"the certificate request for {name} is not signed by its own key") from error
-        if str(request.subject) != f"CN={name}":
+        if str(request.subject) != f"CN={check_name(name)}":
             raise IdentityError(f"the certificate request says {request.subject}, not CN={name}")
-        certificates.append(
-            x509.issue(
-                request,
-                ca.certificate,
-                ca.key,
-                not_before=max(at - _BACKDATED, ca.certificate.not_before),
-                not_after=min(at + _LIFE, ca.certificate.not_after),
-                key_usage=usage,
-                extended_key_usage=(_extended_key_usage(Role(role)),),
-                subject_alt_names=("URI:" + uri(role, name),),
-            )
-        )
-    if signing_request.public_key.to_bytes() == encryption_request.public_key.to_bytes():
+        certificates.append(x509.issue(
+            request, ca.certificate, ca.key, key_usage=usage, extended_key_usage=(_extended_key_usage(role),),
+            subject_alt_names=(f"{URI_PREFIX}{role}:{name}",),
+            not_before=max(at - _BACKDATED, ca.certificate.not_before),
+            not_after=min(at + _LIFE, ca.certificate.not_after),
+        ))  # fmt: skip
+    if signing_request.public_key == encryption_request.public_key:
         raise IdentityError("the signing and the encryption key must be two keys")
-    return PeerIdentity(Role(role), name, *certificates)
+    return PeerIdentity(role, name, *certificates)
 
 
 def enrol(ca: CertificateAuthority, role: Role, name: str, *, at: datetime) -> Identity:
     """A new identity with two fresh keys and their certificates."""
-    signing_key, encryption_key = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
-    peer = enrol_requests(ca, role, name, *requests(name, signing_key, encryption_key), at=at)
-    return Identity(
-        peer.role, name, signing_key, peer.signing_certificate, encryption_key, peer.encryption_certificate
-    )
+    keys = sm2.PrivateKey.generate(), sm2.PrivateKey.generate()
+    peer = enrol_requests(ca, role, name, *requests(name, *keys), at=at)
+    return Identity(role, name, peer.signing_certificate, peer.encryption_certificate, *keys)
 
 
 # Files
@@ -367,13 +323,11 @@ def certificate_files(peer: PeerIdentity, roots: Sequence[x509.Certificate]) -> 
     }
 
 
-def identity_files(
-    identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None
-) -> dict[str, bytes]:
+def identity_files(identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None) -> dict[str, bytes]:
     """An identity as file name → content; keys are PKCS#8 PEM, encrypted under `password` unless None."""
     keys = (identity.signing_key, identity.encryption_key)
     private = {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)}
-    return private | certificate_files(identity.public, roots)
+    return private | certificate_files(identity, roots)
 
 
 def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
@@ -389,9 +343,7 @@ def public_identity(pem: bytes) -> PeerIdentity:
     found = read_certificates(pem)
     if len(found) != 2:
         raise IdentityError(f"a file holds {len(found)} certificates; an identity has two, signing and encryption")
-    if _holder(found[0]) != _holder(found[1]):
-        raise IdentityError("the signing and the encryption certificate are of two identities")
-    return PeerIdentity(*_holder(found[0]), *found)
+    return _pair(*found)
 
 
 def split_certificates(certificates: bytes) -> tuple[bytes, bytes]:
@@ -413,29 +365,24 @@ def identity_from_files(
     files: Mapping[str, bytes], password: bytes | None
 ) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """The reverse of `identity_files`: the identity and the roots. Keys must belong to their certificates."""
-    missing = [name for name in _FILES if name not in files]
-    if missing:
+    if missing := [name for name in _FILES if name not in files]:
         raise IdentityError(f"the identity is not complete: {', '.join(missing)} missing")
     keys: list[sm2.PrivateKey] = []
-    for name in KEY_FILES:
+    certificates: list[x509.Certificate] = []
+    for name in ("sign", "enc"):
         try:
-            keys.append(sm2.PrivateKey.from_pem(files[name], password))
+            keys.append(sm2.PrivateKey.from_pem(files[f"{name}.key.pem"], password))
         except SMCryptoError as error:
-            raise IdentityError(f"{name} cannot be opened: wrong password, or not a key file") from error
-    (signing, *_), (encryption, *_) = (read_certificates(files[n]) for n in ("sign.crt.pem", "enc.crt.pem"))
-    for key, certificate, name in zip(keys, (signing, encryption), ("sign", "enc"), strict=True):
-        if key.public_key.to_bytes() != certificate.public_key.to_bytes():
+            raise IdentityError(f"{name}.key.pem cannot be opened: wrong password, or not a key file") from error
+        certificates.append(read_certificates(files[f"{name}.crt.pem"])[0])
+        if keys[-1].public_key != certificates[-1].public_key:
             raise IdentityError(f"{name}.key.pem is not the key of {name}.crt.pem")
-    holder = _holder(signing)
-    if _holder(encryption) != holder:
-        raise IdentityError("sign.crt.pem and enc.crt.pem are of two identities")
-    identity = Identity(*holder, keys[0], signing, keys[1], encryption)
+    peer = _pair(*certificates)
+    identity = Identity(peer.role, peer.name, peer.signing_certificate, peer.encryption_certificate, *keys)
     return identity, read_certificates(files["ca.crt.pem"])
 
 
-def save_identity(
-    folder: Path, identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None
-) -> None:
+def save_identity(folder: Path, identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None) -> None:
     """Write `identity_files` into `folder` (made 0700 if absent), key files 0600; nothing is overwritten."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in identity_files(identity, roots, password).items():
@@ -447,11 +394,12 @@ def save_identity(
 
 def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """Read what `save_identity` wrote; a key file that others may read is refused."""
-    files: dict[str, bytes] = {}
-    for name in _FILES:
-        path = folder / name
-        try:
-            files[name] = read_private(path) if name in KEY_FILES else path.read_bytes()
-        except OSError as error:
-            raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
-    return identity_from_files(files, password)
+    read = {name: read_private if name in KEY_FILES else _read for name in _FILES}
+    return identity_from_files({name: read[name](folder / name) for name in _FILES}, password)
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise IdentityError(f"{path} cannot be read: {error.strerror}") from error

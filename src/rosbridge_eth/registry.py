@@ -7,11 +7,10 @@ server asks `allows` at every handshake and closes what is no longer allowed.
 
 from __future__ import annotations
 
+import os
 import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -69,41 +68,21 @@ class Registry:
 
     def __init__(self, path: Path, *, new: bool = False) -> None:
         self._path = path
-        self._file = None if new else self._file_now()
         try:
             self._db = sqlite3.connect(
-                f"{path.absolute().as_uri()}?mode={'rwc' if new else 'rw'}",
-                uri=True, timeout=10, isolation_level=None, check_same_thread=False,
-            )
-        except sqlite3.Error as error:
-            raise StoreError(self._lost(f"it cannot be opened as a database, {error}")) from error
-        try:
-            self._begin(new)
-        except sqlite3.Error as error:
-            self._db.close()
+                f"{path.absolute().as_uri()}?mode={'rwc' if new else 'rw'}", uri=True, timeout=10, isolation_level=None,
+                check_same_thread=False,
+            )  # fmt: skip
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA synchronous=FULL")
+            self._db.executescript(SCHEMA)
+            self._file = path.stat()
+            begun = set(self._db.execute("SELECT role, name FROM enrolment"))
+        except (sqlite3.Error, OSError) as error:
             raise StoreError(self._lost(f"it cannot be used as a database, {error}")) from error
-        except BaseException:
-            self._db.close()
-            raise
-
-    def _begin(self, new: bool) -> None:
-        self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute("PRAGMA synchronous=FULL")
-        self._db.executescript(SCHEMA)
-        if new:
-            self._file = self._file_now()
-            return
-        found = set(self._db.execute("SELECT DISTINCT role, name FROM enrolment WHERE role IN ('server', 'reader')"))
-        if ("reader", OWNER) not in found or not any(role == "server" for role, _ in found):
+        if not new and (("reader", OWNER) not in begun or "server" not in {role for role, _ in begun}):
+            self.close()
             raise StoreError(self._lost("it lacks the server and the owner, whom `init` enrolled"))
-
-    def _file_now(self) -> tuple[int, int]:
-        """Which file stands at the path; StoreError if there is none."""
-        try:
-            found = self._path.stat()
-        except OSError as error:
-            raise StoreError(self._lost(error.strerror or str(error))) from error
-        return found.st_dev, found.st_ino
 
     def _lost(self, why: str) -> str:
         return f"the registry {self._path} was lost or damaged ({why}): restore {self._path.name} from your backup"
@@ -117,22 +96,16 @@ class Registry:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @contextmanager
-    def _transaction(self) -> Iterator[None]:
-        self._db.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-        except BaseException:
-            self._db.execute("ROLLBACK")
-            raise
-        self._db.execute("COMMIT")
-
     def revision(self) -> tuple[int, int]:
         """Another value after every change, whichever process made it; cheap, so readers can keep what they read.
 
         StoreError where another file, or none, stands at the path by now: changes would be made there and never seen.
         """
-        if self._file_now() != self._file:
+        try:
+            replaced = not os.path.samestat(self._path.stat(), self._file)
+        except OSError as error:
+            raise StoreError(self._lost(error.strerror or str(error))) from error
+        if replaced:
             raise StoreError(
                 f"the registry {self._path} was replaced by another file while it was open, and what is in that one is"
                 " not known here; end this process and start it again"
@@ -155,52 +128,48 @@ class Registry:
     def enrol(
         self, peer: PeerIdentity, now: datetime, *, number: int | None = None, account: str | None = None,
         replace: bool = False,
-    ) -> Enrolment:
+    ) -> None:  # fmt: skip
         """Put an identity in force; with `replace` the one that held the name is revoked in the same write.
 
         number: of the account, for a robot; otherwise the next one.
         """
-        with self._transaction():
+        with self._db:  # commits, or rolls back
+            self._db.execute("BEGIN IMMEDIATE")
             if replace:
-                self._revoke(peer.role, peer.name, now)
-            else:
-                self.require_free(peer.role, peer.name)
-            self._db.execute(
-                "INSERT INTO enrolment VALUES (?, ?, ?, ?, ?, ?, ?, ?, NULL)",
-                (
-                    self.next_number() if number is None else number, str(peer.role), peer.name,
-                    peer.signing_certificate.fingerprint(), peer.pem, keccak(peer.certificates), account,
-                    now.isoformat(),
-                ),
-            )
-        found = self.find(peer.role, peer.name)
-        if found is None:
-            raise StoreError(f"the registry lost {peer} as it was written; check the disk")
-        return found
-
-    def _revoke(self, role: str, name: str, now: datetime) -> int:
-        return self._db.execute(
-            "UPDATE enrolment SET revoked_at = ? WHERE role = ? AND name = ? AND revoked_at IS NULL",
-            (now.isoformat(), str(role), name),
-        ).rowcount
+                self.revoke(peer.role, peer.name, now)
+            self.require_free(peer.role, peer.name)
+            row = (
+                number or self.next_number(), str(peer.role), peer.name, peer.signing_certificate.fingerprint(),
+                peer.pem, keccak(peer.certificates), account, now.isoformat(),
+            )  # fmt: skip
+            self._db.execute("INSERT INTO enrolment VALUES (?, ?, ?, ?, ?, ?, ?, ?, NULL)", row)
 
     def revoke(self, role: str, name: str, now: datetime) -> bool:
         """Take a name out of force; whether it was in force."""
-        return self._revoke(role, name, now) > 0
-
-    def find(self, role: str, name: str) -> Enrolment | None:
-        """The enrolment in force under this name."""
-        rows = self._db.execute(
-            "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (str(role), name)
-        ).fetchall()
-        return _enrolment(rows[0]) if rows else None
+        changed = self._db.execute(
+            "UPDATE enrolment SET revoked_at = ? WHERE role = ? AND name = ? AND revoked_at IS NULL",
+            (now.isoformat(), str(role), name),
+        )
+        return changed.rowcount > 0
 
     def all(self, role: str | None = None) -> list[Enrolment]:
         """Every enrolment there ever was, in order."""
         rows = self._db.execute(
             "SELECT * FROM enrolment WHERE ?1 IS NULL OR role = ?1 ORDER BY number", (role and str(role),)
-        ).fetchall()
-        return [_enrolment(row) for row in rows]
+        )
+        return [_enrolment(*row) for row in rows]
+
+    def find(self, role: str, name: str) -> Enrolment | None:
+        """The enrolment in force under this name."""
+        row = self._db.execute(
+            "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (str(role), name)
+        ).fetchone()
+        return _enrolment(*row) if row else None
+
+    def allows(self, peer: PeerIdentity) -> bool:
+        """Is this very certificate the one in force for the name?"""
+        found = self.find(peer.role, peer.name)
+        return found is not None and found.fingerprint == peer.signing_certificate.fingerprint()
 
     def readers(self) -> list[Enrolment]:
         """The readers in force."""
@@ -214,22 +183,7 @@ class Registry:
         """Every robot there ever was: Tk to its name."""
         return {tk: robot.name for tk, robot in self.robots().items()}
 
-    def allows(self, peer: PeerIdentity) -> bool:
-        """Is this very certificate the one in force for the name?"""
-        found = self.find(peer.role, peer.name)
-        return found is not None and found.fingerprint == peer.signing_certificate.fingerprint()
 
-    def certificates_hash(self, name: str) -> bytes | None:
-        """keccak256 of the certificates in force for a robot, as its registration has them; None without any."""
-        found = self.find(Role.ROBOT, name)
-        return None if found is None else found.hash
-
-
-def _enrolment(row: tuple[Any, ...]) -> Enrolment:
-    *known, enrolled_at, revoked_at = row
-    times = (_moment(enrolled_at), None if revoked_at is None else _moment(revoked_at))
-    return Enrolment(*(*known, *times))
-
-
-def _moment(text: str) -> datetime:
-    return datetime.fromisoformat(text).astimezone(UTC)
+def _enrolment(*row: Any) -> Enrolment:
+    values = [*row[:-2], *(text and datetime.fromisoformat(text) for text in row[-2:])]
+    return Enrolment(*values)

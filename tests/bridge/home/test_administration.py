@@ -324,7 +324,7 @@ def test_a_robot_with_its_own_keys_is_registered_and_nothing_secret_is_in_its_bu
     assert (standing.account, event.block) == (made.account, made.block)
     assert world.ledger.balance(made.account) == 5 * 10**17
     with registry(world) as known:
-        assert known.certificates_hash("robot_1") == standing.certificates_hash and known.allows(peer)
+        assert known.robots()[TK].hash == standing.certificates_hash and known.allows(peer)
     assert robot.bridge().server_address == "127.0.0.1:7410" and robot.bridge().ledger == world.ledger.ledger
 
 
@@ -501,7 +501,7 @@ def test_a_crash_between_any_two_steps_is_mended_by_doing_it_again(
     peer = load_identity(world.path / "robot-51/identity", b"robot's")[0].public
     [standing] = world.ledger.standings([TK])
     with registry(world) as known:
-        assert known.allows(peer) and known.certificates_hash("robot_1") == standing.certificates_hash
+        assert known.allows(peer) and known.robots()[TK].hash == standing.certificates_hash
     assert standing.account == new.account != old.account and not standing.revoked
     assert world.written() == [] and len(world.inbox.dead()) == 2
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosbridge_eth.errors import IdentityError
-from rosbridge_eth.files import box_head, open_box, read_private, require_private, seal_box, write_atomically
+from rosbridge_eth.files import box_head, open_box, read_private, seal_box, write_atomically
 
 HEAD = {"format": "rosbridge-eth bundle 2", "name": "robot_1"}
 FORMAT = HEAD["format"]
@@ -53,7 +53,7 @@ def test_a_file_with_a_secret_must_be_private(tmp_path: Path) -> None:
     for mode in (0o644, 0o640, 0o604, 0o620, 0o601):
         os.chmod(key, mode)
         with pytest.raises(IdentityError, match=rf"open to others \(mode {mode:04o}\); run `chmod 600"):
-            require_private(key)
+            read_private(key)
     for mode in (0o600, 0o400):
         os.chmod(key, mode)
         assert read_private(key) == b"secret"

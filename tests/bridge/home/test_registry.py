@@ -63,8 +63,8 @@ def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
     assert {tk: (robot.number, robot.revoked_at) for tk, robot in robots.items()} == {
         robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON),
     }
-    assert registry.certificates_hash("robot_1") == keccak(newest.certificates)
-    assert registry.certificates_hash("robot_2") is None
+    assert robots[robot_id("robot_1")].hash == keccak(newest.certificates)
+    assert registry.find("robot", "robot_2") is None
     assert robots[robot_id("robot_2")].hash == keccak(second.certificates)
     assert [reader.name for reader in registry.readers()] == ["owner"]
 
