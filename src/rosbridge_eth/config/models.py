@@ -584,6 +584,3 @@ class ReaderConfig(Section):
     def ledger(self) -> bytes:
         """What every signature of a log covers, 32 bytes (chunk.ledger_id)."""
         return ledger_of(self.chain_id, self.genesis, self.contract)
-
-
-ROOTS: dict[str, type[Section]] = {"robot.toml": RobotConfig, "server.toml": ServerConfig, "reader.toml": ReaderConfig}

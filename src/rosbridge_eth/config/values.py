@@ -97,12 +97,6 @@ def duration_text(seconds: float) -> str:
     return fits[0] if fits else f"{round(seconds * 1000)}ms"
 
 
-def size_text(size: int) -> str:
-    """As a person writes it."""
-    units = ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB"), (1, "B"))
-    return next(f"{size // unit} {name}" for unit, name in units if size % unit == 0)
-
-
 def time_text(nanoseconds: int) -> str:
     """As a person writes it, to the millisecond."""
     moment = _EPOCH + timedelta(milliseconds=nanoseconds // 10**6)

@@ -1,20 +1,28 @@
 """The reference of every key, from the models: the tables of docs/configuration.md, which a test compares.
 
-python -m rosbridge_eth.config.reference docs/configuration.md     writes them anew, between their markers
+python docs/make_configuration.py     writes them anew, between their markers
 """
 
 from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
-from rosbridge_eth.config.models import ROOTS
-from rosbridge_eth.config.values import duration_text, size_text
+from rosbridge_eth.config import ReaderConfig, RobotConfig, ServerConfig
+from rosbridge_eth.config.values import duration_text
+
+ROOTS = {"robot.toml": RobotConfig, "server.toml": ServerConfig, "reader.toml": ReaderConfig}
+
+
+def size_text(size: int) -> str:
+    """As a person writes it."""
+    units = ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB"), (1, "B"))
+    return next(f"{size // unit} {name}" for unit, name in units if size % unit == 0)
+
 
 _WORDS = {"string": "string", "integer": "whole number", "number": "number", "boolean": "true or false"}
 _BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "exclusiveMaximum": "below", "maximum": "to"}
@@ -87,6 +95,5 @@ def rewritten(document: str) -> str:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        path = Path(name)
-        path.write_text(rewritten(path.read_text(encoding="utf-8")), encoding="utf-8")
+    document = Path(__file__).with_name("configuration.md")
+    document.write_text(rewritten(document.read_text(encoding="utf-8")), encoding="utf-8")
