@@ -213,6 +213,7 @@ class Submitter:
 
     def _look(self, head: Block, now: float) -> bool:
         """Whether there is something to send or in flight."""
+        self._inbox.append([], now)  # InboxExchanged, if it was
         self._fees = self._ledger.fees(head).limited(self._settings.max_fee)
         # Before the balances: what is in a block by now is in them, so nobody is topped up twice.
         [funds] = self._ledger.nonces([self._operator.address]) if self._operator else [(0, 0)]
@@ -299,6 +300,8 @@ class Submitter:
     def _walk(self, tk: bytes, account: Account, standing: Standing, oldest: Header | None, now: float) -> None:
         """Read back until it is known whether `oldest` is on the chain, the first of the rows in question (None: there
         are none); then make the inbox follow. Goes on in the next turn where that takes long.
+
+        What is not confirmed becomes rows again: the chain may turn back, and the robot not send it any more.
         """
         final = (self.head.number if self.head else 0) - self._settings.confirmations + 1
         walk = account.walk = account.walk or Walk(self._ledger.newest_data(tk, standing.data_block), final)
@@ -321,31 +324,24 @@ class Submitter:
         self._inbox.raise_heads(tk, walk.heads, now)  # from here on, nothing of it is taken
         after = self._inbox.find(tk, standing.tail)
         if after is None or any(row.digest in walk.on_chain for row in self._inbox.rows(tk, after, 2**31)):
-            self._follow(tk, walk, now)
+            try:
+                tail, *before = [Chunk.parse(encoded) for encoded in walk.newest]
+            except Malformed as error:
+                raise _Hold(f"what another program wrote is on the chain: {error}") from error
+            self._inbox.rebase(tk, tail, walk.on_chain, {}, now, before[::-1])
             account.flights = []
+            self.counts["rebases"] += 1
         if oldest is not None and oldest.digest not in walk.on_chain:
             account.new = oldest.digest
-
-    def _follow(self, tk: bytes, walk: Walk, now: float) -> None:
-        """What is not confirmed becomes rows again, for the chain may turn back and the robot not send it any more."""
-        self.counts["rebases"] += 1
-        try:
-            newest = [Chunk.parse(encoded) for encoded in walk.newest]
-        except Malformed as error:
-            raise _Hold(f"what another program wrote is on the chain: {error}") from error
-        on_chain = walk.on_chain
-        for chunk in newest:  # each in front of the ones before
-            self._inbox.rebase(tk, chunk, on_chain, {}, now)
-            on_chain = set()
 
     # ------------------------------------------------------------------ send
 
     def _send(self, work: Sequence[Work], head: Block, now: float) -> None:
         nonces = self._ledger.nonces([w.standing.account or "" for w in work])
         # Looked at twice, with the nonces in between: where both looks agree, the nonces belong to them.
-        again = self._ledger.standings([w.tk for w in work])
+        second = self._ledger.standings([w.tk for w in work])
         steady = [
-            (w, nonce) for w, nonce, then in zip(work, nonces, again, strict=True)
+            (w, nonce) for w, nonce, then in zip(work, nonces, second, strict=True)
             if (w.standing.chunks, w.standing.tail) == (then.chunks, then.tail)
         ]  # fmt: skip
         room = 2 * head.gas_limit - sum(f.gas for account in self._known.values() for f in account.flights)
@@ -355,14 +351,15 @@ class Submitter:
             try:
                 rows = self._rows(w, account, now)
                 self._reconcile(account, w.standing, rows, latest, now)
-                again_from = self._resend(account, latest, pending, now)
-                new = self._batches(w, account, rows, head, room, now) if again_from is not None else []
+                if (again := self._again(account, latest, pending, now)) is None:
+                    continue
+                new = self._batches(w, account, rows, head, room, now)
             except _Hold as why:
                 account.hold = str(why)
                 continue
             room -= sum(batch.gas for batch in new)
             account.flights += new
-            for number, batch in list(enumerate(account.flights, latest))[again_from:]:
+            for number, batch in list(enumerate(account.flights, latest))[again:]:
                 outbox.append((account, account.fees or self._fees, self._signed(w.tk, account, number, batch)))
                 if sum(len(raw) for _, _, raw in outbox) > SEND_BYTES:
                     self._flush(outbox)
@@ -387,7 +384,7 @@ class Submitter:
             account.since = now
         account.nonce = latest
 
-    def _resend(self, account: Account, latest: int, pending: int, now: float) -> int | None:
+    def _again(self, account: Account, latest: int, pending: int, now: float) -> int | None:
         """From which of its flights on the account is to send again; None: it waits for what is in the pool."""
         in_pool, flights = max(pending - latest, 0), len(account.flights)
         if in_pool and account.due(now):
@@ -513,11 +510,10 @@ class Submitter:
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:
     """As many rows as one transaction takes, one at least."""
-    count, size, sizes = 0, 0, list[int]()
+    count, size, gas = 0, 0, set_data_gas([])
     for row in rows:
-        sizes.append(row.size)
-        size += row.size
-        if count and (size > BATCH_BYTES or set_data_gas(sizes) > most):
+        more = set_data_gas([row.size]) - set_data_gas([])
+        if count and (size + row.size > BATCH_BYTES or gas + more > most):
             break
-        count += 1
-    return Batch(first, tail, tuple(rows[:count]), set_data_gas(sizes[:count]), count < len(rows))
+        count, size, gas = count + 1, size + row.size, gas + more
+    return Batch(first, tail, tuple(rows[:count]), gas, count < len(rows))

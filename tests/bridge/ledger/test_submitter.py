@@ -11,7 +11,7 @@ import pytest
 
 from bridge.ledger.model_chain import ETH, GWEI
 from bridge.ledger.world import KEYS, Pen, World
-from rosbridge_eth.inbox import Head, Outcome
+from rosbridge_eth.inbox import Head, InboxExchanged, Outcome
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.submitter import ALL, BATCH_BYTES, IN_FLIGHT, PATIENCE, Submitter
 
@@ -341,6 +341,19 @@ def test_an_old_copy_of_the_inbox_is_put_back(world: World):
     world.take(world.pen.chunks(5))
     world.run()
     assert world.model.reverted == 0
+
+
+def test_an_inbox_that_is_deleted_under_it_is_noticed(world: World):
+    world.take(world.pen.chunks(3))
+    world.run()
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{world.inbox_path}{suffix}").unlink(missing_ok=True)
+    with pytest.raises(InboxExchanged):
+        world.turn()
+    world.turn()
+    assert set(world.take(world.pen.written)) == {Outcome.KNOWN}
+    world.take(world.pen.chunks(1))
+    world.run()
 
 
 def test_an_old_copy_to_which_the_robot_sends_what_it_lacks(world: World):

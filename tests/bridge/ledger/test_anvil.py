@@ -1,0 +1,249 @@
+"""The same on a real node: anvil, with what it can be made to do wrong, and the file that keeps its chain."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from eth_utils.crypto import keccak
+
+from bridge.ledger.world import ETH, KEYS, World
+from bridge.load_script import load_script
+from conftest import unavailable
+from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.errors import ChainError
+from rosbridge_eth.ledger import Ledger, nodes
+from rosbridge_eth.ledger.contract import NOTHING, Fees
+from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.ledger.transport import AlreadyKnown, NonceTooLow, OutOfFunds, Reverted, Underpriced
+
+pytestmark = pytest.mark.service
+
+OPERATOR, ROBOT, TK = KEYS.operator, KEYS.robot(1), robot_id("robot_1")
+GWEI = 10**9
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def start(port: int, **options) -> Anvil:
+    if not shutil.which("anvil") and not shutil.which("npx"):
+        unavailable("neither anvil nor npx is installed")
+    try:
+        return Anvil.start(port, **options)
+    except ChainError as error:
+        unavailable(str(error))
+        raise
+
+
+@pytest.fixture(scope="module")
+def node() -> Iterator[Anvil]:
+    with start(free_port()) as running:
+        yield running
+
+
+@pytest.fixture
+def ledger(node: Anvil) -> Ledger:
+    """A fresh chain with the contract."""
+    node.ask("anvil_reset")
+    node.ask("evm_setAutomine", True)
+    node.ask("anvil_setBalance", ROBOT.address, "0x0")  # anvil makes its own accounts rich
+    return Ledger.deploy(node.url, OPERATOR)[0]
+
+
+def test_chunks_get_there_and_are_confirmed(ledger: Ledger, tmp_path: Path):
+    world = World(tmp_path, ledger=ledger)
+    world.take(world.pen.chunks(40, 8_000))
+    world.run()
+    assert world.confirmed() == world.pen.last
+
+
+def test_the_nodes_refusals_are_understood(ledger: Ledger, node: Anvil):
+    with pytest.raises(Reverted) as caught:
+        ledger.revoke_robot(ROBOT, TK)
+    assert (caught.value.name, caught.value.arguments) == ("NotOperator", (ROBOT.address.lower(),))
+    assert str(caught.value) == f"the contract refuses: NotOperator(sender {ROBOT.address.lower()})"
+    node.ask("evm_setAutomine", False)
+    [(nonce, _)] = ledger.nonces([OPERATOR.address])
+
+    def signed(account=OPERATOR, number=nonce, price=10 * GWEI, value=0) -> bytes:
+        return ledger.sign(account, b"", nonce=number, gas=60_000, fees=Fees(price, GWEI), value=value).raw
+
+    answers = ledger.send(
+        [signed(), signed(), signed(value=1), signed(number=0), signed(ROBOT, 0), signed(price=20 * GWEI),
+         signed(number=nonce + 1, price=1), signed(number=nonce + 5), b"\x02"]
+    )  # fmt: skip
+    kinds = [None, AlreadyKnown, Underpriced, NonceTooLow, OutOfFunds, None, Underpriced, None, ChainError]
+    assert [type(answer) if answer else None for answer in answers[:-1]] == kinds[:-1]
+    assert isinstance(answers[-1], ChainError)
+    assert ledger.nonces([OPERATOR.address, ROBOT.address]) == [(nonce, nonce + 1), (0, 0)]
+
+
+def test_a_robot_without_money_is_refused_by_the_contract(ledger: Ledger):
+    ledger.registration(OPERATOR, TK, ROBOT.address, b"")
+    with pytest.raises(Reverted, match="NoBalance"):
+        ledger.set_data(ROBOT, TK, [b"a"])
+
+
+def test_several_batches_in_one_block_are_all_found(ledger: Ledger, node: Anvil):
+    ledger.registration(OPERATOR, TK, ROBOT.address, b"1")
+    ledger.alloc_eth(OPERATOR, ROBOT.address, ETH)
+    node.ask("evm_setAutomine", False)
+    tail, raws, fees = NOTHING, [], Fees(20 * GWEI, GWEI)
+    for i in range(3):
+        data = ledger.calldata("setData", TK, i, tail, [b"%d" % i])
+        raws.append(ledger.sign(ROBOT, data, nonce=i, gas=200_000, fees=fees).raw)
+        tail = keccak(b"%d" % i)
+    [(nonce, _)] = ledger.nonces([OPERATOR.address])
+    for i in range(2):
+        data = ledger.calldata("replaceRegistration", TK, ROBOT.address, b"%d" % i)
+        raws.append(ledger.sign(OPERATOR, data, nonce=nonce + i, gas=300_000, fees=Fees(20 * GWEI, 2 * GWEI - i)).raw)
+    assert ledger.send(raws) == [None] * 5
+    node.ask("anvil_mine", "0x1")
+    [standing] = ledger.standings([TK])
+    block = standing.data_block
+    assert block == standing.changed_block
+    assert [(e.first, e.previous_block) for e in ledger.newest_data(TK, block)] == [(2, block), (1, block), (0, 0)]
+    changes = ledger.registrations(TK, standing)
+    assert [e.certificates for e in changes] == [b"1", b"0", b"1"]
+    assert [e.block for e in changes[1:]] == [block, block]
+
+
+def test_a_node_that_hangs_is_waited_for(ledger: Ledger, node: Anvil, tmp_path: Path):
+    world = World(tmp_path, ledger=Ledger(node.url, ledger.contract, timeout=0.5))
+    world.take(world.pen.chunks(5))
+    os.killpg(node.pid, signal.SIGSTOP)
+    try:
+        world.turn()
+        assert "too slow" in str(world.submitter.trouble)
+    finally:
+        os.killpg(node.pid, signal.SIGCONT)
+    world.run()
+    assert world.submitter.trouble is None
+
+
+def test_dropped_and_reorganised_transactions_are_sent_again(ledger: Ledger, node: Anvil, tmp_path: Path):
+    world = World(tmp_path, ledger=ledger)
+    node.ask("evm_setAutomine", False)
+    world.take(world.pen.chunks(20, 8_000))
+    world.turn()
+    assert world.submitter.in_flight == 2
+    node.ask("anvil_dropAllTransactions")
+    world.turn()
+    node.ask("anvil_mine", "0x1")
+    world.turn()
+    assert world.on_chain() == world.pen.digests
+    node.ask("anvil_reorg", 1, [])
+    assert world.on_chain() == []
+    node.ask("evm_setAutomine", True)
+    world.run()
+
+
+# ---------------------------------------------------------------------- the file
+
+
+def chain_state(port: int, state: Path, write: int = 0) -> tuple[bytes, list[bytes]]:
+    """Start, write so many chunks, end orderly; the genesis and all chunks."""
+    with start(port, state=state) as running:
+        running.fund(OPERATOR.address, 100)
+        try:
+            contract = (state.parent / "contract").read_text()
+            ledger = Ledger(running.url, contract)
+        except FileNotFoundError:
+            ledger, _ = Ledger.deploy(running.url, OPERATOR)
+            (state.parent / "contract").write_text(ledger.contract)
+            ledger.registration(OPERATOR, TK, ROBOT.address, b"certificates")
+        for _ in range(write):
+            ledger.set_data(ROBOT, TK, [os.urandom(5_000)])
+        [standing] = ledger.standings([TK])
+        chunks = [chunk for e in ledger.newest_data(TK, standing.data_block) for chunk in e.chunks]
+        return ledger.genesis, chunks[::-1]
+
+
+def test_a_chain_stays_the_same_however_often_its_node_is_started(tmp_path: Path):
+    port, state = free_port(), tmp_path / "chain"
+    seen, before = set(), list[bytes]()
+    for _ in range(4):
+        genesis, chunks = chain_state(port, state, write=2)
+        seen.add(genesis)
+        assert chunks[: len(before)] == before
+        before = chunks
+        time.sleep(1.1)  # the next start's own first block is of another second
+    assert len(seen) == 1
+    assert len(before) == 8
+    numbers = [int(block["header"]["number"], 16) for block in json.loads(state.read_bytes())["blocks"]]
+    assert sorted(numbers) == list(range(len(numbers))), "one first block, the chain's own"
+
+
+def test_a_kill_costs_what_was_not_saved_and_never_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    port, state = free_port(), tmp_path / "chain"
+    genesis, chunks = chain_state(port, state, write=3)
+    monkeypatch.setattr(nodes, "SAVE_SECONDS", 0.05)
+    monkeypatch.setattr(nodes, "SAVE_SHARE", 0)
+    for _ in range(3):
+        running = start(port, state=state)
+        ledger = Ledger(running.url, (tmp_path / "contract").read_text())
+        for _ in range(5):
+            chunks.append(os.urandom(5_000))
+            ledger.set_data(ROBOT, TK, chunks[-1:])
+            json.loads(state.read_bytes())  # whole at every moment
+        running.kill()
+        assert not running.running()
+        found = chain_state(port, state)
+        assert found[0] == genesis
+        assert 3 <= len(found[1]) <= len(chunks)
+        assert found[1] == chunks[: len(found[1])]
+        chunks = found[1]
+    assert list(tmp_path.glob(".chain*")) == []
+
+
+def test_the_size_is_known_and_a_large_one_is_told(tmp_path: Path, monkeypatch, caplog: pytest.LogCaptureFixture):
+    monkeypatch.setattr(nodes, "TOLD_FROM", 1000)
+    with start(free_port(), state=tmp_path / "chain") as running:
+        assert running.state_size == (tmp_path / "chain").stat().st_size > 1000
+    assert "use geth" in caplog.text
+
+
+def test_a_state_file_that_is_damaged_is_said(tmp_path: Path, node: Anvil):
+    (state := tmp_path / "chain.json").write_text('{"blocks": [{"head')
+    with pytest.raises(ChainError, match=r"chain\.json is damaged"):
+        Anvil.start(free_port(), state=state)
+
+
+def test_a_port_in_use_is_said(node: Anvil):
+    port = int(node.url.rsplit(":", 1)[1])
+    with pytest.raises(ChainError, match="in use"):
+        Anvil.start(port)
+
+
+def test_a_missing_program_is_said(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ChainError, match="install one of them"):
+        Anvil.start(free_port())
+
+
+# ---------------------------------------------------------------------- at random
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(("chain", "seed"), [("anvil", 0), ("anvil", 1), ("anvil", 2), ("clique", 0), ("clique", 1)])
+def test_every_chunk_is_written_once_whatever_happens(chain: str, seed: int, node: Anvil):
+    """benchmarks/ledger_faults.py, of which many more seeds were run by hand (docs/ledger.md)."""
+    load_script("clique")  # which the other imports
+    faults = load_script("ledger_faults")
+    try:
+        result = faults.run(chain, seed, 6.0)
+    except faults.clique.Unavailable as reason:
+        unavailable(str(reason))
+    assert faults.is_right(result), json.dumps(result, indent=1)
