@@ -9,9 +9,10 @@ import pytest
 
 from bridge.channel.steps import Steps, events
 from bridge.channel.world import make_client
-from rosbridge_eth.channel import ClientConfig
+from rosbridge_eth.channel import ClientConfig, End, Message
 from rosbridge_eth.channel.delivery import MAX_PTO
-from rosbridge_eth.channel.wire import SEGMENT_SIZE, Ack, Frame
+from rosbridge_eth.channel.session import RECEIVE_SEGMENTS
+from rosbridge_eth.channel.wire import SEGMENT_HEADER, SEGMENT_SIZE, Ack, Frame
 
 
 class Line:
@@ -108,7 +109,8 @@ def test_a_segment_is_not_sent_again_for_a_packet_whose_place_another_has_taken(
     assert len(probes) == 2 and line.counted == (0, 2)
     [later] = line.send(100)
     line.acknowledge([later], round_trip=0.05)
-    assert line.flush() == [] and line.counted == (2, 2)  # both packets of before are lost, but their segments are on their way already
+    assert line.flush() == []  # both packets of before are lost, but their segments are on their way already
+    assert line.counted == (2, 2)
     line.acknowledge([*probes, later])
     assert line.session.idle and line.counted == (2, 2)
 
@@ -178,3 +180,47 @@ def test_an_end_acknowledges_after_eight_packets_at_once_at_a_gap_and_else_after
     assert session.timer(steps.now) > steps.now + 1.0
     assert steps.to_server(client._seal(Ack(0, 0.0, 1, 1025, 1).to_bytes())) == []  # asks for nothing, gets nothing
     assert session.timer(steps.now) > steps.now + 1.0
+
+
+def test_a_sender_for_whom_there_is_no_room_asks_again_after_a_probe_timeout():
+    line = Line()
+    line.pass_time(0.05)
+    line.session._limit_out = line.session._next_out
+    line.steps.client.send(bytes(100))
+    assert line.flush() == []
+    probes = line.pass_time(line.session.pto + 0.01)
+    assert len(probes) in (2, 4)
+    assert line.session._unsent
+    line.acknowledge(probes)  # with a new limit
+    assert len(line.flush()) == 1
+
+
+def test_a_program_that_takes_what_waited_makes_room_and_the_sender_is_told_at_once():
+    steps = Steps().until_connected()
+    session = steps.client._session
+    while (event := steps.server.next_event()) is not None:
+        assert not isinstance(event, Message)
+    data = (SEGMENT_SIZE - 4).to_bytes(4, "big") + bytes(SEGMENT_SIZE - 4)
+    for index in range(1, RECEIVE_SEGMENTS):
+        steps.to_server(session._seal(SEGMENT_HEADER.pack(Frame.SEGMENT, index) + data))
+    session._next_out = RECEIVE_SEGMENTS
+    [connection] = steps.server._connections.values()
+    steps.now += 1.0
+    steps.server.handle_timer(steps.now)
+    steps.server.datagrams_to_send(steps.now)
+    assert connection.session._limit_in < RECEIVE_SEGMENTS + 100
+    assert len(events(steps.server)) == RECEIVE_SEGMENTS - 1
+    assert connection.session._limit_in == 2 * RECEIVE_SEGMENTS
+    steps.to_client(*(data for data, _ in steps.server.datagrams_to_send(steps.now)))
+    assert session._limit_out == 2 * RECEIVE_SEGMENTS
+
+
+def test_a_session_ends_when_its_peers_numbers_are_used_up():
+    steps = Steps().until_connected()
+    events(steps.server)
+    steps.client._session.next_number = 2**20 - 1
+    steps.to_server(steps.client._session._seal(bytes((Frame.PING,))))
+    assert events(steps.server) == []
+    steps.to_server(steps.client._session._seal(bytes((Frame.PING,))))
+    [ended] = events(steps.server)
+    assert ended.reason is End.EXPIRED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -34,7 +35,10 @@ def test_the_replay_window_takes_each_number_once_and_nothing_too_old(numbers):
 def test_the_replay_window_is_at_least_1024_wide_and_does_not_grow():
     window = ReplayWindow()
     window.mark(0)
+    tracemalloc.start()
     window.mark(2**31)
+    assert tracemalloc.get_traced_memory()[1] < 100_000  # no integer of 2**31 bits on the way
+    tracemalloc.stop()
     assert not window.seen(2**31 - 1024) and window.seen(0)
     assert window.bits.bit_length() <= window.size
 
