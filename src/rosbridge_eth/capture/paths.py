@@ -14,9 +14,8 @@ data as {"pose": {"pose": {"position": {"x": ...}}}}, and `ranges[0]` as
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 _SEGMENT = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:\[(\*|[0-9]{1,9})\])?", re.ASCII)
 
@@ -71,20 +70,3 @@ def _check(node: Selection) -> None:
         raise ValueError("one array is selected by [*] and by an index; choose one of them")
     for below in (*node.members.values(), *node.elements.values(), *([node.each] if node.each else ())):
         _check(below)
-
-
-def value_at(data: Mapping[str, Any], path: str) -> Any:
-    """What a record's data holds at `path`; KeyError where there is nothing. `[*]` is not looked up."""
-    value: Any = data
-    for step in parse_path(path):
-        if isinstance(step, str) and isinstance(value, Mapping):
-            value = value[step]
-        elif isinstance(step, int) and isinstance(value, Mapping):
-            value = value[str(step)]
-        elif isinstance(step, int) and isinstance(value, Sequence) and not isinstance(value, str):
-            if step >= len(value):
-                raise KeyError(path)
-            value = value[step]
-        else:
-            raise KeyError(path)
-    return value

@@ -1,13 +1,13 @@
 """From a raw message to a line: is it due, decode it, choose its fields, write it, keep it within bounds.
 
-No clock and no I/O: times come in as arguments, and what a person should hear goes out through a callback, once per
-topic and cause. Not thread-safe: one thread feeds one Capture.
+No clock and no I/O: times come in as arguments. What a person should hear is logged once per topic and cause; the
+counters say how often it happened. Not thread-safe: one thread feeds one Capture.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, NamedTuple
@@ -40,15 +40,6 @@ class Cause(StrEnum):
 
 DROPPED: Final = "dropped"
 """Why a message is missing that a live source could not hand over in time."""
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """Said once per topic and cause; the counters say how often it happened."""
-
-    topic: str
-    cause: Cause
-    text: str
 
 
 class Captured(NamedTuple):
@@ -91,32 +82,20 @@ class _Topic:
         return TopicStatistics(seen, self.captured, self.not_due, left_out - undecodable, undecodable, digested)
 
 
-def _log(notice: Notice) -> None:
-    log.warning("%s: %s", notice.topic, notice.text)
-
-
 class Capture:
     """Captures by rules; a topic that none of them names or matches is not captured.
 
-    source_kind: stands in every line. notify: is given each Notice; by default it is logged as a warning.
+    source_kind: stands in every line.
     live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
     that is an error of the configuration.
     """
 
-    def __init__(
-        self,
-        rules: Sequence[TopicRule],
-        *,
-        source_kind: str,
-        notify: Callable[[Notice], None] = _log,
-        live: bool = False,
-    ) -> None:
+    def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
         self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
         self._selections = {id(rule): parse_paths(rule.fields) if rule.fields else EVERYTHING for rule in rules}
         self._topics: dict[str, _Topic | None] = {}
         self._source_kind = source_kind
-        self._notify = notify
         self._live = live
         self._declared: dict[tuple[str, str], int] = {}  # losses that are in a line already, by topic and why
 
@@ -133,38 +112,26 @@ class Capture:
             return None
         try:
             conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
-        except ConfigError as error:
-            if not self._live:
-                raise
-            self._left_out(raw, topic, Cause.FIELD_MISSING, str(error))
-            return None
-        digested_before = conversion.digested
-        try:
+            digested_before = conversion.digested
             if not 0 <= raw.received_ns <= _LAST_TIME:
                 raise DecodeError(f"its receive time is {raw.received_ns}")
             data = conversion.convert(raw.decoder.decode(raw.raw))
+        except ConfigError as error:
+            if not self._live:
+                raise
+            return self._left_out(raw, topic, Cause.FIELD_MISSING, str(error))
         except DecodeError as error:
-            self._left_out(raw, topic, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
-            return None
+            return self._left_out(raw, topic, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
         except FieldTooLarge as error:
             why = f'{error}, more than {topic.rule.limit}; choose other fields, or oversize = "digest"'
-            self._left_out(raw, topic, Cause.FIELD_TOO_LARGE, why)
-            return None
-        line = orjson.dumps(
-            {
-                "topic": raw.topic,
-                "type": raw.type_name,
-                "source": self._source_kind,
-                "received_ns": raw.received_ns,
-                "captured_ns": wall_ns,
-                "clock": clock_synchronised,
-                "data": data,
-            }
-        )
+            return self._left_out(raw, topic, Cause.FIELD_TOO_LARGE, why)
+        line = orjson.dumps({
+            "topic": raw.topic, "type": raw.type_name, "source": self._source_kind,
+            "received_ns": raw.received_ns, "captured_ns": wall_ns, "clock": clock_synchronised, "data": data,
+        })  # fmt: skip
         if len(line) > MAX_LINE:
             why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
-            self._left_out(raw, topic, Cause.RECORD_TOO_LARGE, why)
-            return None
+            return self._left_out(raw, topic, Cause.RECORD_TOO_LARGE, why)
         if conversion.digested > digested_before:
             text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
             self._count(raw.topic, topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
@@ -195,14 +162,6 @@ class Capture:
         """By topic, in the order in which they were first seen."""
         return {name: topic.statistics() for name, topic in self._topics.items() if topic is not None}
 
-    @property
-    def finished(self) -> bool:
-        """Every rule names one topic and none of them will capture anything more."""
-        return all(
-            pattern.is_exact and (topic := self._topics.get(pattern.text)) is not None and topic.schedule.finished
-            for pattern, _ in self._rules
-        )
-
     def _topic(self, name: str) -> _Topic | None:
         if name not in self._topics:
             rule = rule_for(name, self._rules)
@@ -216,10 +175,12 @@ class Capture:
         topic.conversions[decoder] = conversion
         return conversion
 
-    def _left_out(self, raw: RawMessage, topic: _Topic, cause: Cause, why: str) -> None:
+    def _left_out(self, raw: RawMessage, topic: _Topic, cause: Cause, why: str) -> Captured | None:
+        """Count it; None is what became of it."""
         self._count(raw.topic, topic, cause, f"a message is left out: {why}")
+        return None
 
     def _count(self, name: str, topic: _Topic, cause: Cause, text: str, count: int = 1) -> None:
         topic.counts[cause] += count
         if topic.counts[cause] == count:
-            self._notify(Notice(name, cause, text))
+            log.warning("%s: %s", name, text)

@@ -60,11 +60,6 @@ class Schedule:
         self._interval = 0.0
         self._set_end()
 
-    @property
-    def finished(self) -> bool:
-        """Nothing more will be due, whatever comes."""
-        return self._done
-
     def due(self, received_ns: int) -> bool:
         """Whether a message received then should be captured; `captured` tells that it was."""
         if self._done or (self._start is not None and received_ns < self._start):
@@ -106,53 +101,33 @@ class NamePattern:
         """Raises ValueError with a sentence."""
         self.text = pattern if pattern.startswith(("/", "**")) else f"/{pattern}"
         self.is_exact = not set(pattern) & set("*?[")
-        self._expression = re.compile(_expression(self.text), re.ASCII)
-
-    def __repr__(self) -> str:
-        return f"NamePattern({self.text!r})"
+        self._expression = _expression(self.text)
 
     def matches(self, name: str) -> bool:
         """Whether `name` (with its leading slash) is meant."""
         return self._expression.fullmatch(name) is not None
 
 
-_GLOB = re.compile(r"\*\*|\*|\?|\[[A-Za-z0-9_\-]+\]|[A-Za-z0-9_/]+", re.ASCII)
+_PIECE = re.compile(r"\*\*|\*|\?|\[[A-Za-z0-9_\-]+\]|[A-Za-z0-9_/]+", re.ASCII)
+_MEANING = {"**": ".*", "*": "[^/]*", "?": "[^/]"}
+"""Of a piece as a regular expression; letters and a class read the same in both notations."""
 
 
-def _expression(pattern: str) -> str:
-    parts = []
-    position = 0
-    while position < len(pattern):
-        match = _GLOB.match(pattern, position)
-        if match is None:
-            raise ValueError(
-                f"{pattern!r} is not a name or pattern: names have letters, digits, _ and /, patterns *, **, ? and [ab]"
-            )
-        piece = match[0]
-        position = match.end()
-        if piece == "**":
-            parts.append(r".*")
-        elif piece == "*":
-            parts.append(r"[^/]*")
-        elif piece == "?":
-            parts.append(r"[^/]")
-        else:
-            parts.append(piece)  # literal characters, or a class, which reads the same in both notations
+def _expression(pattern: str) -> re.Pattern[str]:
+    pieces = _PIECE.findall(pattern)
+    if "".join(pieces) != pattern:
+        raise ValueError(
+            f"{pattern!r} is not a name or pattern: names have letters, digits, _ and /, patterns *, **, ? and [ab]"
+        )
     if "//" in pattern or pattern.endswith("/"):
         raise ValueError(f"{pattern!r} is not a name or pattern: it has an empty part")
     try:
-        re.compile("".join(parts))
+        return re.compile("".join(_MEANING.get(piece, piece) for piece in pieces), re.ASCII)
     except re.error:
         raise ValueError(f"{pattern!r} is not a pattern: a range in [...] is out of order") from None
-    return "".join(parts)
 
 
 def rule_for(topic: str, rules: Sequence[tuple[NamePattern, TopicRule]]) -> TopicRule | None:
     """The rule of a topic: the one that names it, otherwise the first whose pattern matches."""
-    for pattern, rule in rules:
-        if pattern.is_exact and pattern.matches(topic):
-            return rule
-    for pattern, rule in rules:
-        if pattern.matches(topic):
-            return rule
-    return None
+    matching = [(pattern, rule) for pattern, rule in rules if pattern.matches(topic)]
+    return next((rule for pattern, rule in matching if pattern.is_exact), matching[0][1] if matching else None)

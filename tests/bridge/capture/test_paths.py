@@ -1,11 +1,10 @@
-"""Field paths: what is one, and looking a value up in a record's data."""
+"""Field paths: what is one."""
 
 from __future__ import annotations
 
 import pytest
 
-from rosbridge_eth.capture import parse_path, value_at
-from rosbridge_eth.capture.paths import parse_paths
+from rosbridge_eth.capture.paths import parse_path, parse_paths
 
 
 def test_paths_are_steps():
@@ -26,13 +25,3 @@ def test_an_array_is_selected_by_index_or_by_star():
     with pytest.raises(ValueError, match="choose one"):
         parse_paths(["a[*].x", "a[0].y"])
     assert parse_paths(["a[*].x", "a[0]", "a"]).members["a"].everything
-
-
-def test_values_are_found_where_the_message_has_them():
-    data = {"pose": {"x": 1.5}, "some": {"3": {"y": 2}}, "all": [{"z": 7}, {"z": 8}]}
-    assert value_at(data, "pose.x") == 1.5
-    assert value_at(data, "some[3].y") == 2
-    assert value_at(data, "all[1].z") == 8
-    for missing in ("pose.y", "pose.x.y", "some[2]", "all[2]", "all[*].z", "pose[0]", "all.z"):
-        with pytest.raises(KeyError):
-            value_at(data, missing)

@@ -9,7 +9,6 @@ import pytest
 from rosbridge_eth.capture import (
     MAX_LINE,
     Captured,
-    Cause,
     LostLine,
     MessageLine,
     RawMessage,
@@ -26,9 +25,15 @@ NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")
 BLOB = decoder_for(Wire.ROS1, "pkg/Blob", "uint8[] data\nint32 x")
 
 
-def Capture(rules, notify=None, **options):
-    said = {} if notify is None else {"notify": notify}
-    return AnyCapture(rules, source_kind="sim", **said, **options)
+def Capture(rules, **options):
+    return AnyCapture(rules, source_kind="sim", **options)
+
+
+def said(caplog) -> list[str]:
+    """What was logged since the last look."""
+    messages = [record.getMessage() for record in caplog.records]
+    caplog.clear()
+    return messages
 
 
 def number(value: int, at: int = 0, topic: str = "/n") -> RawMessage:
@@ -60,10 +65,9 @@ def test_a_topic_without_a_rule_is_not_captured_nor_counted():
     assert capture.statistics() == {}
 
 
-def test_everything_seen_is_counted_once():
-    notices = []
+def test_everything_seen_is_counted_once(caplog):
     rules = [TopicRule("/n", rate=1), TopicRule("/b", oversize="refuse", limit=1024), TopicRule("/d", limit=1024)]
-    capture = Capture(rules, notices.append)
+    capture = Capture(rules)
     for tick in range(10):
         capture.process(number(tick, at=tick * 10**8), 0)
     for size in (10, 2000, 3000):
@@ -79,17 +83,18 @@ def test_everything_seen_is_counted_once():
     for topic in counts.values():
         assert topic.seen == topic.captured + topic.not_due + topic.refused + topic.undecodable
     # Said once per topic and cause, naming the field and what to do.
-    assert [(notice.topic, notice.cause) for notice in notices] == [
-        ("/b", Cause.FIELD_TOO_LARGE),
-        ("/d", Cause.FIELD_DIGESTED),
-        ("/n", Cause.UNDECODABLE),
+    told = said(caplog)
+    assert told[:2] == [
+        '/b: a message is left out: data has 2000 bytes, more than 1024; choose other fields, or oversize = "digest"',
+        "/d: data is above 1024 bytes: its SM3 digest is captured instead",
     ]
-    assert "data has 2000 bytes" in notices[0].text
+    assert len(told) == 3
+    assert told[2].startswith("/n: a message is left out: it cannot be decoded: ")
 
 
 def test_what_is_not_in_the_log_is_declared_once():
     rules = [TopicRule("/n", rate=1), TopicRule("/b", oversize="refuse", limit=1024), TopicRule("/d", limit=1024)]
-    capture = Capture(rules, lambda notice: None)
+    capture = Capture(rules)
     assert capture.lost({}) == []
     for size in (10, 2000, 3000):
         capture.process(blob(size), 0)
@@ -110,15 +115,15 @@ def test_what_is_not_in_the_log_is_declared_once():
 
 
 @pytest.mark.parametrize("moment", [-1, 2**63, 10**30])
-def test_a_receive_time_that_is_none_costs_its_message_only(moment):
-    notices = []
-    capture = Capture([TopicRule("/n")], notices.append)
+def test_a_receive_time_that_is_none_costs_its_message_only(moment, caplog):
+    capture = Capture([TopicRule("/n")])
     assert capture.process(number(1, at=moment), 0) is None
     assert capture.process(number(1, at=5), 0) is not None
-    assert [notice.cause for notice in notices] == [Cause.UNDECODABLE]
+    assert capture.statistics()["/n"].undecodable == 1
+    assert said(caplog) == [f"/n: a message is left out: it cannot be decoded: its receive time is {moment}"]
 
 
-def test_the_bound_on_a_line_is_in_bytes_and_exact():
+def test_the_bound_on_a_line_is_in_bytes_and_exact(caplog):
     decoder = decoder_for(Wire.ROS1, "pkg/Words", "string[] s")
     frame = len(
         '{"topic":"/w","type":"pkg/msg/Words","source":"sim","received_ns":0,"captured_ns":0,"clock":false,'
@@ -129,12 +134,13 @@ def test_the_bound_on_a_line_is_in_bytes_and_exact():
         for letters, fits in ((most, True), (most + 1, False)):
             encoded = (letter * letters).encode()
             raw = pack("<II", 1, len(encoded)) + encoded
-            notices = []
-            capture = Capture([TopicRule("/w", limit=1 << 20)], notices.append)
+            capture = Capture([TopicRule("/w", limit=1 << 20)])
             captured = capture.process(RawMessage("/w", "pkg/msg/Words", 0, raw, decoder), 0)
             assert (captured is not None) is fits, (letter, letters)
             assert captured is None or MAX_LINE - 1 <= len(captured.line) <= MAX_LINE
-            assert [notice.cause for notice in notices] == [] if fits else [Cause.RECORD_TOO_LARGE]
+            told = "/w: a message is left out: its fields come to more than 61440 bytes of JSON; choose fewer fields"
+            assert said(caplog) == ([] if fits else [told])
+            assert capture.lost({}) == ([] if fits else [b'{"lost":1,"topic":"/w","why":"record_too_large"}'])
 
 
 def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
@@ -145,15 +151,15 @@ def test_a_field_the_type_does_not_have_is_an_error_of_the_configuration():
         capture.process(number(1), 0)
 
 
-def test_a_live_publisher_of_a_type_without_the_field_does_not_end_the_robot():
-    notices = []
-    capture = Capture([TopicRule("/x", fields=("data",))], notices.append, live=True)
+def test_a_live_publisher_of_a_type_without_the_field_does_not_end_the_robot(caplog):
+    capture = Capture([TopicRule("/x", fields=("data",))], live=True)
     assert capture.process(blob(1, "/x"), 0) is not None
     assert capture.process(number(1, topic="/x"), 0) is None
     assert capture.process(number(2, topic="/x"), 0) is None
     assert capture.process(blob(1, "/x"), 0) is not None
-    assert [notice.cause for notice in notices] == [Cause.FIELD_MISSING]
-    assert "has no field 'data'" in notices[0].text
+    [told] = said(caplog)
+    assert "/x: a message is left out: " in told
+    assert "has no field 'data'" in told
     statistics = capture.statistics()["/x"]
     assert (statistics.seen, statistics.captured, statistics.refused) == (4, 2, 2)
 
@@ -173,17 +179,6 @@ def test_types_may_change_under_a_topic():
     capture = Capture([TopicRule("/**")])
     assert capture.process(number(1, topic="/x"), 0).data == {"x": 1}
     assert capture.process(blob(1, "/x"), 0).data == {"data": "AA==", "x": 1}
-
-
-def test_it_is_finished_when_no_rule_can_capture_more():
-    capture = Capture([TopicRule("/n", once=True), TopicRule("/m", once=True)])
-    assert not capture.finished
-    capture.process(number(1), 0)
-    assert not capture.finished
-    capture.process(number(1, topic="/m"), 0)
-    assert capture.finished
-    assert capture.process(number(1), 0) is None
-    assert not Capture([TopicRule("/*", once=True)]).finished
 
 
 def test_a_malformed_rule_is_refused_at_once():

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from rosbridge_eth.capture import Capture, TopicRule, value_at
+from bridge.sources.values import value_at
+from rosbridge_eth.capture import Capture, TopicRule
 from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, sample_bag
 
 

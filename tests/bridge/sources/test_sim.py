@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosbridge_eth.capture import Capture, TopicRule, parse_line, value_at
+from bridge.sources.values import value_at
+from rosbridge_eth.capture import Capture, TopicRule, parse_line
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources import Selection, SimSettings, SimSource
 from rosbridge_eth.sources.sim import RADIUS, SPEED, Motion, advance, drive
