@@ -9,7 +9,8 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -80,7 +81,6 @@ _EXPECTED = {
     "list_type": "a list in [ ]",
     "dict_type": "a table",
     "model_type": "a table",
-    "model_attributes_type": "a table",
     "greater_than": "more than {gt}",
     "greater_than_equal": "at least {ge}",
     "less_than": "less than {lt}",
@@ -107,10 +107,14 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
     elif kind == "missing":
         sentence = f"{key} is missing"
     elif kind == "literal_error":
-        allowed = [part.strip() for part in re.split(r",| or ", str(context["expected"]))]
-        near = difflib.get_close_matches(repr(given), allowed, 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        sentence = f"{key} is {_shown(given)}; allowed: {', '.join(allowed)}{hint}"
+        allowed = re.findall(r"'(.*?)'", context["expected"])
+        sentence = f"{key} is {_shown(given)}; {_choose(given, allowed)}"
+    elif kind == "union_tag_not_found":
+        sentence = f"{key} has no kind; {_choose(None, SOURCE_KINDS)}"
+    elif kind == "union_tag_invalid":
+        sentence = f"{key} has kind {given['kind']!r}; {_choose(given['kind'], SOURCE_KINDS)}"
+    elif kind == "model_attributes_type":
+        sentence = f'{key} is {_shown(given)}; write a table, such as [source] with kind = "bag"'
     elif kind in _EXPECTED:
         topic = len(location) == 2 and location[0] == "topics"
         expected = "a name in quotes, or a table" if topic else _EXPECTED[kind].format(**context)
@@ -125,6 +129,12 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
         sentence = f"{key} is {_shown(given)}; {_decapitalised(detail['msg'])}"
     line = _line(text, location)
     return f"line {line}: {sentence}" if line and location else sentence
+
+
+def _choose(given: Any, allowed: Collection[str]) -> str:
+    near = difflib.get_close_matches(str(given), allowed, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"allowed: {', '.join(map(repr, allowed))}{hint}"
 
 
 def _unknown(model: type[Section], location: Sequence[str | int]) -> str:
@@ -169,25 +179,29 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     return [model for argument in get_args(annotation) for model in _models_in(argument)]
 
 
-def _line(text: str, location: Sequence[str | int]) -> int | None:
+_HEADER = re.compile(r"\s*(\[\[?)\s*([A-Za-z0-9_\-.\s]+?)\s*\]")
+_DOT = re.compile(r"\s*\.\s*")
+_SETTING = re.compile(r"\s*([A-Za-z0-9_\-]+(?:\s*\.\s*[A-Za-z0-9_\-]+)*)\s*=")
+
+
+def _line(text: str, location: tuple[str | int, ...]) -> int | None:
     """The line on which the key at `location` is set, or of the nearest table or key around it that is found."""
     lines: dict[tuple[str | int, ...], int] = {}
+    counts: Counter[tuple[str | int, ...]] = Counter()
     table: tuple[str | int, ...] = ()
-    counts: dict[tuple[str | int, ...], int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*(\[\[?)\s*([A-Za-z0-9_\-.\s]+?)\s*\]", line):
-            name = tuple(part.strip() for part in header[2].split("."))
-            table = (*name, counts.setdefault(name, 0)) if header[1] == "[[" else name
+        if header := _HEADER.match(line):
+            path = table = tuple(re.split(_DOT, header[2]))
             if header[1] == "[[":
-                counts[name] += 1
-            lines.setdefault(table, number)
-            lines.setdefault(name, number)
-        elif setting := re.match(r"\s*([A-Za-z0-9_\-]+(?:\s*\.\s*[A-Za-z0-9_\-]+)*)\s*=", line):
-            keys = tuple(part.strip() for part in setting[1].split("."))
-            for end in range(1, len(keys) + 1):
-                lines.setdefault((*table, *keys[:end]), number)
-    return next((lines[tuple(location[:end])] for end in range(len(location), 0, -1)
-                 if tuple(location[:end]) in lines), None)
+                counts[path] += 1
+                path = table = (*path, counts[path] - 1)
+        elif setting := _SETTING.match(line):
+            path = (*table, *re.split(_DOT, setting[1]))
+        else:
+            continue
+        for end in range(1, len(path) + 1):
+            lines.setdefault(path[:end], number)
+    return next((lines[location[:end]] for end in range(len(location), 0, -1) if location[:end] in lines), None)
 
 
 def _shown(value: Any) -> str:

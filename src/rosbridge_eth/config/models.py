@@ -6,7 +6,6 @@ A robot's whole configuration may be `topics = ["/robot_1/odom"]`, where the env
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +21,7 @@ from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of
 
 if TYPE_CHECKING:
-    from rosbridge_eth.sources import Selection
-    from rosbridge_eth.sources.kinds import SourceSettings
+    from rosbridge_eth.sources import Selection, SourceSettings
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
 
@@ -74,31 +72,29 @@ def _listed(value: Any) -> Any:
 
 _HOST = r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]+)"
 _PART = "[A-Za-z][A-Za-z0-9_]*"
-Pattern: TypeAlias = Annotated[str, AfterValidator(_pattern)]
-FieldPath: TypeAlias = Annotated[str, AfterValidator(_field_path)]
-Speed: TypeAlias = Annotated[float | None, BeforeValidator(_speed), WithJsonSchema({"type": 'number or `"max"`'})]
-Mode: TypeAlias = Literal["exchange", "transport"]
-Name: TypeAlias = Annotated[str, _matching(
+Pattern = Annotated[str, AfterValidator(_pattern)]
+FieldPath = Annotated[str, AfterValidator(_field_path)]
+Speed = Annotated[float | None, BeforeValidator(_speed), WithJsonSchema({"type": 'number or `"max"`'})]
+Mode = Literal["exchange", "transport"]
+Name = Annotated[str, _matching(
     r"[a-z0-9][a-z0-9_.\-]{0,62}", "a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")]
-MasterUri: TypeAlias = Annotated[str, _matching(
+MasterUri = Annotated[str, _matching(
     rf"http://{_HOST}(?::\d{{1,5}})?/?", 'write the master\'s URI, such as "http://192.0.2.7:11311"')]
-Host: TypeAlias = Annotated[str, _matching(
+Host = Annotated[str, _matching(
     r"[A-Za-z0-9_.\-]+|[0-9A-Fa-f]*:[0-9A-Fa-f]*:[0-9A-Fa-f:.]*", "write a name or an address, without a port")]
-Ros1Node: TypeAlias = Annotated[str, _matching(
+Ros1Node = Annotated[str, _matching(
     rf"/?{_PART}(?:/{_PART})*", 'a node\'s name has letters, digits, _ and /, such as "/robot_1/recorder"')]
-Ros2Node: TypeAlias = Annotated[str, _matching(
-    r"(?=.{1,255}\Z)[A-Za-z_](?:_?[A-Za-z0-9])*_?",
-    "a node's name has letters, digits and single _, and no digit in front")]
-TopicPart: TypeAlias = Annotated[str, _matching(
+Ros2Node = Annotated[str, _matching(
+    r"(?=.{1,255}\Z)[A-Za-z_](?:_?[A-Za-z0-9])*_?", "a node's name has letters, digits, single _, and no digit first")]
+TopicPart = Annotated[str, _matching(
     r"[A-Za-z][A-Za-z0-9_]{0,62}", "it becomes part of a topic's name: letters, digits and _")]
-NodeUrl: TypeAlias = Annotated[str, _matching(
+NodeUrl = Annotated[str, _matching(
     rf"https?://(?:[^\s@/]+@)?{_HOST}(?::\d{{1,5}})?(?:[/?]\S*)?",
     'a node\'s URL; write "http://127.0.0.1:8545" or "https://..."', secret=True)]
-StoreUrl: TypeAlias = Annotated[str, _matching(
+StoreUrl = Annotated[str, _matching(
     r"sqlite|rediss?://\S+|unix://\S+", 'a store; write "sqlite" or "redis://127.0.0.1:6379/0"', secret=True)]
-ContractAddress: TypeAlias = Annotated[str, _matching(
-    "0x[0-9a-fA-F]{40}", "an address is 0x and 40 hexadecimal digits")]
-Hash: TypeAlias = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexadecimal digits")]
+ContractAddress = Annotated[str, _matching("0x[0-9a-fA-F]{40}", "an address is 0x and 40 hexadecimal digits")]
+Hash = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexadecimal digits")]
 
 
 # The robot
@@ -284,44 +280,6 @@ SOURCE_KINDS: dict[str, type[AnySource]] = {"bag": BagConfig, "ros1": Ros1Config
 _ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
 
 
-def _known_kind(value: Any) -> Any:
-    if isinstance(value, dict):
-        kind, allowed = value.get("kind"), ", ".join(map(repr, SOURCE_KINDS))
-        if kind is None:
-            raise ValueError(f"has no kind; allowed: {allowed}")
-        if kind not in SOURCE_KINDS:
-            near = difflib.get_close_matches(str(kind), SOURCE_KINDS, 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"has kind {kind!r}; allowed: {allowed}{hint}")
-    elif value is not None and not isinstance(value, Section):
-        raise ValueError(f'is {value!r}; write a table, such as [source] with kind = "bag"')
-    return value
-
-
-SourceConfig: TypeAlias = Annotated[AnySource, Discriminator("kind")]
-
-
-def source_of_environment(environment: Mapping[str, str]) -> tuple[AnySource, str]:
-    """The source of a robot that is configured with none: the ROS that is set up there, and how it is known.
-
-    ConfigError where no ROS is: a simulation in its place would sign invented records.
-    """
-    version, distribution = environment.get("ROS_VERSION"), environment.get("ROS_DISTRO")
-    if version in ("1", "2"):
-        kind, why = f"ros{version}", f"ROS_VERSION is {version}"
-    elif master := environment.get("ROS_MASTER_URI"):
-        kind, why = "ros1", f"ROS_MASTER_URI is {master}"
-    elif distribution:
-        kind, why = "ros1" if distribution in _ROS1_DISTRIBUTIONS else "ros2", f"ROS_DISTRO is {distribution}"
-    else:
-        raise ConfigError(
-            "robot.toml has no [source] and the environment speaks of no ROS (ROS_VERSION, ROS_MASTER_URI,"
-            ' ROS_DISTRO): set ROS up in this shell, or write [source] with kind = "ros1", "ros2", "bag" or, to try'
-            ' it out with invented messages, "sim"'
-        )
-    return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
-
-
 class LogConfig(Section):
     """The log that the robot writes: what was captured in a `period`, from all topics, is one chunk of it.
 
@@ -382,7 +340,7 @@ class RobotConfig(Section):
     channel: Mode = "exchange"
     readers: list[FilePath] | None = None
     monitor: HostPort | None = None
-    source: Annotated[SourceConfig | None, BeforeValidator(_known_kind)] = None
+    source: Annotated[AnySource, Discriminator("kind")] | None = None
     capture: CaptureConfig = CaptureConfig()
     log: LogConfig = LogConfig()
     spool: SpoolConfig = SpoolConfig()
@@ -412,10 +370,26 @@ class RobotConfig(Section):
         ]
 
     def source_and_why(self, environment: Mapping[str, str]) -> tuple[AnySource, str]:
-        """Where messages come from, as configured or else as `environment` says, and the reason for a person."""
+        """Where messages come from, as configured or else from the ROS that is set up there; and how that is known.
+
+        ConfigError where no ROS is: a simulation in its place would sign invented records.
+        """
         if self.source is not None:
             return self.source, "as configured"
-        return source_of_environment(environment)
+        version, distribution = environment.get("ROS_VERSION"), environment.get("ROS_DISTRO")
+        if version in ("1", "2"):
+            kind, why = f"ros{version}", f"ROS_VERSION is {version}"
+        elif master := environment.get("ROS_MASTER_URI"):
+            kind, why = "ros1", f"ROS_MASTER_URI is {master}"
+        elif distribution:
+            kind, why = "ros1" if distribution in _ROS1_DISTRIBUTIONS else "ros2", f"ROS_DISTRO is {distribution}"
+        else:
+            raise ConfigError(
+                "robot.toml has no [source] and the environment speaks of no ROS (ROS_VERSION, ROS_MASTER_URI,"
+                ' ROS_DISTRO): set ROS up in this shell, or write [source] with kind = "ros1", "ros2", "bag" or, to try'
+                ' it out with invented messages, "sim"'
+            )
+        return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
 
     def selection(self) -> Selection:
         """For sources.open_source."""
