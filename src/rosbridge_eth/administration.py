@@ -15,10 +15,9 @@ import struct
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from rosbridge_eth import identity as ids
@@ -28,18 +27,7 @@ from rosbridge_eth.config import Address, ServerConfig, load_server_config, pars
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import read_private, write_atomically
-from rosbridge_eth.home import (
-    BridgeEnd,
-    Deployment,
-    HomeKind,
-    OperatorHome,
-    ReaderHome,
-    RobotHome,
-    home_of,
-    kind_of,
-    make_home,
-    require_empty,
-)
+from rosbridge_eth.home import Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, require_empty
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
@@ -68,18 +56,14 @@ def own_address(listen: Address) -> Address:
         return listen
     loopback, far = ("127.0.0.1", "192.0.2.1") if family == socket.AF_INET else ("::1", "2001:db8::1")
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        try:
+        with suppress(OSError):
             probe.connect((far, 9))  # sends nothing; chooses the route
             return listen._replace(host=probe.getsockname()[0])
-        except OSError:
-            for _, name in socket.if_nameindex() if family == socket.AF_INET else ():
-                try:
-                    answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
-                except OSError:
-                    continue  # an interface without an address
-                host = socket.inet_ntoa(answer[20:24])
-                if not host.startswith("127."):
-                    return listen._replace(host=host)
+        for _, name in socket.if_nameindex() if family == socket.AF_INET else ():
+            with suppress(OSError):  # of an interface without an address
+                answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                if answer[20] != 127:
+                    return listen._replace(host=socket.inet_ntoa(answer[20:24]))
     return listen._replace(host=loopback)
 
 
@@ -147,11 +131,7 @@ def _make_ca(folder: Path, passphrase: bytes, now: datetime) -> CertificateAutho
 
 def server_trust(home: OperatorHome, registry: Registry) -> ids.Trust:
     """Whom the server believes: certificates of the CA that are in force in the registry."""
-    try:
-        roots = ids.read_certificates(home.ca_certificate.read_bytes())
-    except OSError as error:
-        raise IdentityError(f"{home.ca_certificate} cannot be read: {error.strerror}") from error
-    return ids.Trust(roots, allowed=registry.allows)
+    return ids.Trust(ids.load_certificates(home.ca_certificate), allowed=registry.allows)
 
 
 def load_server_identity(home: OperatorHome, passphrase: bytes) -> ids.Identity:
@@ -187,7 +167,7 @@ def backup(path: Path, target: Path) -> None:
     skipped = shutil.ignore_patterns("*.sqlite*", "*.lock", ".*", "home.json")
     shutil.copytree(path, target, ignore=skipped, dirs_exist_ok=True)
     for database in path.glob("*.sqlite"):
-        if database != RobotHome(path).spool:
+        if database.name != "spool.sqlite":
             with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(target / database.name)) as copy:
                 ours.backup(copy)
             (target / database.name).chmod(0o600)
@@ -199,7 +179,7 @@ def change_passphrase(path: Path, old: bytes, new: bytes) -> list[Path]:
 
     A CA in a folder elsewhere keeps its own.
     """
-    folder = {HomeKind.OPERATOR: "server", HomeKind.ROBOT: "identity", HomeKind.READER: "."}[kind_of(path)]
+    folder = {HomeKind.OPERATOR: "server", HomeKind.ROBOT: "identity", HomeKind.READER: "."}[home_of(path)["kind"]]
     files, changed = [file for name in (folder, "ca") for file in (path / name).glob("*.key.pem")], dict[Path, bytes]()
     if (accounts := OperatorHome(path).accounts).exists():
         files.append(accounts)
@@ -241,14 +221,15 @@ def deploy_contract(
             ledger, receipt = Ledger.deploy(where, keys.operator)
             break
         except (ChainUnavailable, OutOfFunds) as error:
-            if clock() >= last:
-                if isinstance(error, OutOfFunds):
-                    raise OutOfFunds(
-                        f"{error}: put at least 1 ETH on the operator's account {keys.operator.address} and deploy"
-                        " again; it pays for the contract and for the robots"
-                    ) from error
+            if clock() < last:
+                pause(0.5)
+            elif isinstance(error, OutOfFunds):
+                raise OutOfFunds(
+                    f"{error}: put at least 1 ETH on the operator's account {keys.operator.address} and deploy"
+                    " again; it pays for the contract and for the robots"
+                ) from error
+            else:
                 raise
-            pause(0.5)
     made = Deployment(ledger.chain_id, "0x" + ledger.genesis.hex(), ledger.contract, receipt.block)
     home.save_deployment(made)
     url = urlsplit(load_server_config(home.config).chain.url)
@@ -311,8 +292,7 @@ def _make_reader(
 # Robots
 
 
-@dataclass(frozen=True, slots=True)
-class Registered:
+class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
     own_keys: nobody but the robot can sign as it. funded: False where the operator's account has no ETH for it; the
@@ -344,36 +324,36 @@ def register_robot(
     compromised: it becomes dead letters instead. inbox: opened where there is something to replace; clock, pause: the
     wall clock. The chain comes before the registry: a crash in between leaves a registration that `replace` replaces.
     """
-    config, deployment, tk = load_server_config(home.config), home.deployment(), robot_id(check_name(name))
+    config, tk = load_server_config(home.config), robot_id(check_name(name))
     if name == OPERATOR:
         raise IdentityError(f"{name!r} is what the treasury's account is called; choose another name for the robot")
     if request is None and not password:
         raise IdentityError("a robot is registered by its request, or under a password that seals the keys made here")
-    if request is not None and request.name != name:
+    if request and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
-    end = BridgeEnd(
-        name, config.name, str(config.address_for_robots()), deployment.chain_id, deployment.genesis,
-        deployment.contract,
-    )
+    end = home.deployment().end(name, config.name, str(config.address_for_robots()))
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:
             registry.require_free(Role.ROBOT, name)
             if standing.account is not None:
-                raise IdentityError(_taken(name, standing))
+                raise IdentityError(
+                    f"robot {name!r} was revoked; give --replace to enrol it anew, with a new account and new keys"
+                    if standing.revoked else
+                    f"the contract knows a robot {name!r} that the registry does not; give --replace to take it over"
+                )
         buried = 0
         if standing.account is not None:
             registry.revoke(Role.ROBOT, name, now)
-            if not compromised and not standing.revoked:
-                if left := _waiting(inbox, tk, patience, clock, pause):
-                    raise StoreError(
-                        f"{left} chunks that the old {name!r} handed to the server are not confirmed on the chain yet,"
-                        " and would count as written after its end: let the server run and register again, or give"
-                        " them up with --compromised"
-                    )
-            else:
-                pause(0.0 if standing.revoked else HANDING_OVER)
-                buried = _bury(inbox, tk, standing, f"{name} was replaced")
+            left = 0 if standing.revoked else _waiting(inbox, tk, 0.0 if compromised else patience, clock, pause)
+            if left and not compromised:
+                raise StoreError(
+                    f"{left} chunks that the old {name!r} handed to the server are not confirmed on the chain yet, and"
+                    " would count as written after its end: let the server run and register again, or give them up"
+                    " with --compromised"
+                )
+            if compromised or standing.revoked:
+                buried = _bury(inbox, ledger, tk, f"{name} was replaced")
         if request is None:
             identity = ids.enrol(ca, Role.ROBOT, name, at=now)
             peer, files = identity.public, ids.identity_files(identity, [ca.certificate], password)
@@ -416,36 +396,29 @@ def _register(
     )
 
 
-def _taken(name: str, standing: Standing) -> str:
-    """Why a name that the registry has not in force cannot be had without `replace`."""
-    if standing.revoked:
-        return f"robot {name!r} was revoked; give --replace to enrol the name anew, with a new account and new keys"
-    return f"the contract knows a robot {name!r} that the registry does not; give --replace to take the name over"
-
-
 def _waiting(
     inbox: Callable[[], Inbox], tk: bytes, patience: float, clock: Callable[[], float], pause: Callable[[float], None]
 ) -> int:
-    """Wait until all that a robot out of force handed to the server is confirmed; how many chunks are not by then."""
-    closed = clock() + HANDING_OVER
+    """Wait until the server closed the session of a robot out of force, and up to `patience` seconds until what it
+    handed over is confirmed; how many chunks are not by then."""
+    pause(HANDING_OVER)
+    last = clock() + patience
     with closing(inbox()) as store:
-        while True:
-            now = clock()
-            waiting = store.totals().get(tk)
-            left = 0 if waiting is None else waiting.chunks
-            if now >= closed and (left == 0 or now >= closed + patience):
-                return left
+        while (waiting := store.totals().get(tk)) is not None and waiting.chunks:
+            if clock() >= last:
+                return waiting.chunks
             pause(0.2)
+    return 0
 
 
-def _bury(inbox: Callable[[], Inbox], tk: bytes, standing: Standing, why: str) -> int:
+def _bury(inbox: Callable[[], Inbox], ledger: Ledger, tk: bytes, why: str) -> int:
     """What the chain does not have of this robot becomes dead letters; how many chunks."""
+    [standing] = ledger.standings([tk])
     with closing(inbox()) as store:
         return store.bury(tk, store.find(tk, standing.tail), why)
 
 
-@dataclass(frozen=True, slots=True)
-class Revoked:
+class Revoked(NamedTuple):
     """block: where the contract ended a robot's right to write; None for others, and where it had none.
 
     buried: chunks that the server has, that are not on the chain, and that became dead letters.
@@ -469,9 +442,10 @@ def revoke(
     with Registry(home.registry) as registry:
         known = any(enrolment.name == name for enrolment in registry.all(role))
         in_force = registry.revoke(role, name, now)
+    nobody = f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
     if role is not Role.ROBOT:
         if not in_force:
-            raise IdentityError(_not_in_force(role, name, known))
+            raise IdentityError(nobody)
         (home.readers / f"{name}.pem").unlink(missing_ok=True)
         return Revoked(None)
     tk = robot_id(name)
@@ -479,20 +453,13 @@ def revoke(
         [standing] = ledger.standings([tk])
         if standing.account is None or standing.revoked:
             if not in_force:
-                raise IdentityError(_not_in_force(role, name, known))
+                raise IdentityError(nobody)
             return Revoked(None)
-        if compromised:
-            pause(HANDING_OVER)
-        else:
-            _waiting(inbox, tk, patience, clock, pause)
-        buried = _bury(inbox, tk, ledger.standings([tk])[0], f"{name} was revoked")
+        _waiting(inbox, tk, 0.0 if compromised else patience, clock, pause)
+        buried = _bury(inbox, ledger, tk, f"{name} was revoked")
         return Revoked(ledger.revoke_robot(keys.operator, tk).block, buried)
     except ChainError as error:
         raise ChainError(
             f"half done: the server takes nothing from {name} any more, but the contract does not know it yet"
             f" ({error}); run `revoke {name}` again when the node answers"
         ) from error
-
-
-def _not_in_force(role: Role, name: str, known: bool) -> str:
-    return f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"

@@ -251,7 +251,7 @@ def load_ca(folder: Path, password: bytes, at: datetime) -> CertificateAuthority
 
     IdentityError where the key does not open, is another's, or the certificate is no CA's or not valid at `at`.
     """
-    certificate = read_certificates(_read(folder / "ca.crt.pem"))[0]
+    certificate = load_certificates(folder / "ca.crt.pem")[0]
     try:
         key = sm2.PrivateKey.from_pem(read_private(folder / "ca.key.pem"), password=password)
     except InvalidKey as error:
@@ -338,6 +338,11 @@ def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
         raise IdentityError(f"a certificate cannot be read: {error}") from error
 
 
+def load_certificates(file: Path) -> tuple[x509.Certificate, ...]:
+    """Those of a file; IdentityError also where it cannot be read."""
+    return read_certificates(_read(file))
+
+
 def public_identity(pem: bytes) -> PeerIdentity:
     """Whom a PEM file of two certificates, signing first, names; nothing of it is checked (`Trust.check`)."""
     found = read_certificates(pem)
@@ -348,17 +353,13 @@ def public_identity(pem: bytes) -> PeerIdentity:
 
 def split_certificates(certificates: bytes) -> tuple[bytes, bytes]:
     """The two (DER) of `PeerIdentity.certificates`; VerificationError if it is not two DER values and nothing else."""
-    parts, rest = list[bytes](), certificates
-    while rest and len(parts) < 2:
-        # SEQUENCE with a two-byte length (X.690, 8.1.3.5): every certificate has between 256 and 65,535 bytes.
-        size = 4 + int.from_bytes(rest[2:4], "big")
-        if rest[:2] != b"\x30\x82" or size > len(rest):
-            break
-        parts.append(rest[:size])
-        rest = rest[size:]
-    if len(parts) != 2 or rest:
-        raise VerificationError("a registration does not hold two certificates")
-    return parts[0], parts[1]
+    # SEQUENCE with a two-byte length (X.690, 8.1.3.5): every certificate has between 256 and 65,535 bytes.
+    size = 4 + int.from_bytes(certificates[2:4], "big")
+    signing, encryption = certificates[:size], certificates[size:]
+    for part in (signing, encryption):
+        if part[:2] != b"\x30\x82" or len(part) != 4 + int.from_bytes(part[2:4], "big"):
+            raise VerificationError("a registration does not hold two certificates")
+    return signing, encryption
 
 
 def identity_from_files(
