@@ -67,7 +67,8 @@ class Database:
         exclusive: bool = False,
         read_only: bool = False,
     ) -> None:
-        self.path, self._what, self._exclusive, self._wal_pages = path, what, exclusive, wal_pages
+        self.path, self._what, self._wal_pages = path, what, wal_pages
+        self._exclusive = exclusive and not read_only
         self._reserve = path.with_name(path.name + ".reserve")
         if read_only and not path.exists():
             raise NothingThere(f"there is no {what} {path} yet")
@@ -92,7 +93,7 @@ class Database:
 
     def _open(self, application: int, schema: str, read_only: bool) -> None:
         with self.errors(opening=True):
-            if self._exclusive and not read_only:
+            if self._exclusive:
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")  # and no -shm file, which would need room
             self._db.execute("PRAGMA temp_store = MEMORY")
             found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]

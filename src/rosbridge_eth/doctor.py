@@ -175,7 +175,7 @@ def monitor(address: Address | None, runs: bool) -> Findings:
     elif conditions or not (taken or runs):
         yield ok("monitor", f"{address} " + ("says ready" if conditions else "is free"))
     else:
-        yield broken("monitor", f"{address} is not answered by this home's process" + (f" ({why})" if taken else ""),
+        yield broken("monitor port", f"{address} is not answered by this home's process" + (f" ({why})" if taken else ""),
                      "stop what has the port, or correct `monitor`; then start again")
 
 
@@ -255,7 +255,7 @@ def door(home: Path, secret: bytes | None) -> Findings:
     try:
         for sock in server_sockets(config.listen):
             sock.close()
-        answers = 0
+        runs = False
         yield ok("UDP port", f"{config.listen} is free: the server does not run")
     except NetworkError as error:
         now = datetime.now(UTC)
@@ -263,13 +263,14 @@ def door(home: Path, secret: bytes | None) -> Findings:
         nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
         near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listen.host, config.listen.host)  # noqa: S104
         place = config.listen._replace(host=near)
-        _, answers = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
-        if answers:
+        events, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
+        runs = any(isinstance(event, HandshakeFailed) and event.hint is not None for event in events)
+        if runs:
             yield ok("UDP port", f"a server answers at {place}")
         else:
             yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
                          f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
-    yield from monitor(config.monitor, answers > 0)
+    yield from monitor(config.monitor, runs)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         granted = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel doubles it: socket(7)

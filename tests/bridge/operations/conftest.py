@@ -1,23 +1,32 @@
-"""A home with a deployed contract and a registered robot, made once and copied for each test."""
+"""A home with a deployed contract, a registered robot and a reader, made once and copied for each test."""
 
 from __future__ import annotations
 
 import shutil
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.bundle import open_bundle
-from rosbridge_eth.home import OperatorHome, RobotHome
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.embedded import EmbeddedChain
-from rosbridge_eth.robot.assembly import join
-from rosbridge_eth.server.administration import deploy_contract, init_home, load_ca, register_robot
+from rosbridge_eth import administration as admin
+from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
+from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.config import Address, load_server_config
+from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.identity import load_ca
+from rosbridge_eth.inbox import Inbox
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.server import Worker
+from rosbridge_eth.supervisor import open_reception, open_store
 
-PASSPHRASE, PASSWORD = b"the operator's own words", b"the robot's own words"
+PASSPHRASE, PASSWORD, READERS = b"the operator's own words", b"the robot's own words", b"the reader's own words"
 NODE = "http://user:node-key@127.0.0.1:9/v1/path-key?token=query-key"
+NODE_SECRETS = ("node-key", "path-key", "query-key")
 
 
 @dataclass(frozen=True)
@@ -35,26 +44,73 @@ class Place:
     def robot(self) -> RobotHome:
         return RobotHome(self.path / "robot")
 
+    @property
+    def ledger(self) -> Ledger:
+        return Ledger.connect(self.chain, self.operator.deployment())
+
+    def inbox(self) -> Inbox:
+        return open_store(load_server_config(self.operator.config), self.operator)
+
+    def configure(self, old: str, new: str) -> None:
+        """Change server.toml."""
+        text = self.operator.config.read_text()
+        assert old in text
+        self.operator.config.write_text(text.replace(old, new))
+
 
 @pytest.fixture(scope="session")
 def _made(tmp_path_factory: pytest.TempPathFactory) -> Place:
     folder, now = tmp_path_factory.mktemp("operations"), datetime.now(UTC)
     home, robot = OperatorHome(folder / "operator"), RobotHome(folder / "robot")
-    init_home(home, PASSPHRASE, listen="127.0.0.1:0", public="127.0.0.1:9", chain_url=NODE, server="server", now=now)
-    keys = Keyring.load(home.accounts, PASSPHRASE)
-    chain = EmbeddedChain(fund={keys.operator.address: 10**21})
-    deploy_contract(home, chain, keys)
-    registered = register_robot(
-        home, "robot_1", ca=load_ca(home, PASSPHRASE), keys=keys, chain=chain, password=PASSWORD, now=now
+    keys = admin.init_home(
+        home, PASSPHRASE, reader=ReaderHome(folder / "reader"), reader_passphrase=READERS, now=now,
+        listen="127.0.0.1:0", public="127.0.0.1:9", chain_url=NODE,
     )
-    join(robot, open_bundle(registered.bundle.read_bytes(), PASSWORD), PASSWORD)
-    (folder / "pass").write_bytes(PASSPHRASE)
-    (folder / "word").write_bytes(PASSWORD)
-    return Place(folder, chain)
+    chain = EmbeddedChain({keys.operator.address: 10**21})
+    place = Place(folder, chain)
+    admin.deploy_contract(home, chain, keys)
+    ask_to_join(robot, "robot_1", PASSWORD)
+    made = admin.register_robot(
+        home, "robot_1", ca=load_ca(home.ca, PASSPHRASE, now), keys=keys, ledger=place.ledger, inbox=place.inbox,
+        now=now, request=Request.decode(robot.request.read_bytes()),
+    )
+    join(robot, read_bundle(made.bundle.read_bytes()))
+    for name, words in (("pass", PASSPHRASE), ("word", PASSWORD), ("readers", READERS)):
+        (folder / name).write_bytes(words)
+    return place
 
 
 @pytest.fixture
-def place(_made: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Place:
+def place(_made: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     shutil.copytree(_made.path, tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
-    return Place(tmp_path / "here", _made.chain)
+    monkeypatch.setenv("COLUMNS", "120")
+    snapshot = _made.chain.ethereum_tester.take_snapshot()
+    yield Place(tmp_path / "here", _made.chain)
+    _made.chain.ethereum_tester.revert_to_snapshot(snapshot)
+
+
+@pytest.fixture
+def keys(place: Place) -> Keyring:
+    return Keyring.load(place.operator.accounts, PASSPHRASE)
+
+
+@pytest.fixture
+def server(place: Place) -> Iterator[Address]:
+    """A real worker at a real port, its loop in a thread; the robot's home knows the address."""
+    config, registry = load_server_config(place.operator.config), Registry(place.operator.registry)
+    [sock] = server_sockets(config.listen)
+    reception = open_reception(
+        0, config, admin.load_server_identity(place.operator, PASSPHRASE), place.operator, registry, place.inbox(),
+        place.operator.deployment(),
+    )
+    worker, stop = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), threading.Event()
+    thread = threading.Thread(target=worker.run, args=(stop.is_set,))
+    thread.start()
+    address = Address(*sock.getsockname()[:2])
+    place.robot.config.write_text(f'topics = ["/robot_1/odom"]\nserver = "{address}"\n[source]\nkind = "sim"\n')
+    yield address
+    stop.set()
+    worker.loop.wake()
+    thread.join(10)
+    registry.close()
