@@ -233,9 +233,13 @@ def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
         Ledger(url, contract, timeout=5), store, keys.keys, keys.get, KEYS.operator,
         submitter.Settings(confirmations=CONFIRMATIONS),
     )  # fmt: skip
+    said = None
     while True:
         try:
             time.sleep(writer.turn(time.time()))
+            holds = [store.state(tk).hold for tk in keys]
+            if said != (said := (writer.trouble, writer.funds, writer.unconfirmed, *holds)):
+                print(f"{time.time():.1f}", *said, dict(writer.counts), sep=" | ", file=sys.stderr, flush=True)
         except BridgeError as error:
             print(error, file=sys.stderr, flush=True)
             time.sleep(0.2)

@@ -232,6 +232,19 @@ def test_ranges_are_halved_where_they_are_refused_and_doubled_again():
             list(ledger(node).data_events(TK, 5, 5))
 
 
+def test_many_requests_go_in_batches_that_nodes_and_their_proxies_take():
+    sizes = []
+
+    def count(connection: socket.socket, body: Any) -> None:
+        sizes.append((len(body), len(json.dumps(body))))
+        answer = [{"jsonrpc": "2.0", "id": request["id"], "result": HASH} for request in body]
+        connection.sendall(http(json.dumps(answer).encode()))
+
+    with HostileNode(count) as node:
+        assert ledger(node).send([bytes(98_000)] * 20 + [b"x"] * 120) == [None] * 140
+    assert all(requests <= 50 and size < 10**6 for requests, size in sizes)
+
+
 @pytest.mark.parametrize(
     ("words", "kind"),
     [
