@@ -62,7 +62,7 @@ def run(benchmark: Any, implementation: str, function: Any, inputs: list[RawMess
 
 
 def captured(rule: TopicRule) -> Any:
-    capture = Capture([rule], source_kind="bag", notify=lambda notice: None)
+    capture = Capture([rule], source_kind="bag")
     return lambda message: capture.process(message, 1).line  # type: ignore[union-attr]
 
 

@@ -20,7 +20,7 @@ from rosbridge_eth.ledger.accounts import Keyring
 from rosbridge_eth.ledger.embedded import EmbeddedChain
 from rosbridge_eth.robot.assembly import join
 from rosbridge_eth.server.administration import deploy_contract, init_home, load_ca, register_robot
-from rosbridge_eth.sources.sample import sample_bag
+from rosbridge_eth.sources import sample_bag
 
 PASSPHRASE, PASSWORD = b"operator's", b"robot's"
 NOW = datetime.now(UTC)

@@ -5,6 +5,7 @@ Depends on nothing else of the bridge but its errors. `sources` produces the Raw
 
 from rosbridge_eth.capture.conversion import Conversion
 from rosbridge_eth.capture.definitions import DefinitionError, normalised_type_name, read_definition
+
 from rosbridge_eth.capture.lines import (  # isort: skip
     MAX_LINE, LostLine, MessageLine, StreamLine, TypeLine, definition_line, parse_line, stream_line,
 )  # fmt: skip

@@ -21,16 +21,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefiniti
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
-from rosbridge_eth.capture import (
-    Decoder,
-    RawMessage,
-    Wire,
-    decoder_for,
-    decoder_for_known,
-    normalised_type_name,
-)
+from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for, decoder_for_known, normalised_type_name
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
 from rosbridge_eth.sources.selection import Selection
 
 log = logging.getLogger(__name__)
@@ -55,7 +48,7 @@ class BagSettings:
     stop_ns: int | None = None
 
 
-class BagSource:
+class BagSource(Source):
     """One bag; it can be run again and then starts anew."""
 
     kind = "bag"
@@ -120,11 +113,6 @@ class BagSource:
     def offers(self) -> Sequence[Offer]:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
         return self._offers
-
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """None: it waits for whoever takes its messages."""
-        return {}
 
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration before the replay."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import ClassVar, Protocol, TypeAlias
 
 from rosbridge_eth.capture import Decoder, RawMessage
 
@@ -29,24 +30,25 @@ class Offer:
 class Source(Protocol):
     """A bag, a simulation, a live master. One thread calls `run`; `offers` and `close` may come from another."""
 
-    @property
-    def kind(self) -> str:
-        """bag, sim, ros1 or ros2: stands in every line of the log."""
+    kind: ClassVar[str]
+    """bag, sim, ros1 or ros2: stands in every line of the log."""
+    live: ClassVar[bool]
+    """Whether topics may still appear: a name that matches nothing is then no error."""
 
-    @property
-    def live(self) -> bool:
-        """Whether topics may still appear: a name that matches nothing is then no error."""
-
+    @abstractmethod
     def offers(self) -> Sequence[Offer]:
         """The topics there are now, sorted by name. Raises SourceError."""
 
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of the chosen topics as far as they are known before the first message; a live source: none."""
+        return {}
 
     @property
     def dropped(self) -> Mapping[str, int]:
         """Messages received but not emitted, `emit` being too slow, by topic; only a live source drops."""
+        return {}
 
+    @abstractmethod
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit messages in receive order until the source ends or `stop` is set. Raises SourceError."""
 

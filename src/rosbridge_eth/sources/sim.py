@@ -13,11 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy
-
-from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for_known
+from rosbridge_eth.capture import Decoder, RawMessage, Restoration, Wire, decoder_for_known
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
 from rosbridge_eth.sources.selection import Selection
 
 SPEED = 0.5
@@ -82,7 +80,7 @@ def drive(seed: int, rate: float) -> Iterator[Motion]:
         tick += 1
 
 
-class SimSource:
+class SimSource(Source):
     """The simulated robot as a source: `/NAME/odom` and `/NAME/imu`, published by the node `/NAME/sim`."""
 
     kind = "sim"
@@ -98,20 +96,15 @@ class SimSource:
             Offer(f"/{settings.robot}/odom", ODOMETRY, (node,)),
         )
         chosen = selection.resolve_all(self._offers, "the simulated robot")
-        self._watched = {offer.topic: _decoder(offer.type_name) for offer in chosen}
+        self._watched = {offer.topic: _restoration(offer.type_name) for offer in chosen}
 
     def offers(self) -> Sequence[Offer]:
         """Odometry and IMU."""
         return self._offers
 
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """None: it waits for whoever takes its messages."""
-        return {}
-
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration beforehand."""
-        return {topic: [decoder] for topic, decoder in self._watched.items()}
+        return {topic: [restoration.decoder] for topic, restoration in self._watched.items()}
 
     def messages(self, start_ns: int) -> Iterator[RawMessage]:
         """The watched messages from a start time on, without waiting."""
@@ -121,11 +114,11 @@ class SimSource:
             if self._settings.duration_ns is not None and passed >= self._settings.duration_ns:
                 return
             for offer in self._offers:
-                if decoder := self._watched.get(offer.topic):
-                    build = _odometry if offer.type_name == ODOMETRY else _imu
-                    message = build(decoder.typestore.types, self._settings.robot, tick, start_ns + passed, motion)
-                    raw = decoder.encode(message)
-                    yield RawMessage(offer.topic, offer.type_name, start_ns + passed, raw, decoder)
+                if restoration := self._watched.get(offer.topic):
+                    at, decoder = start_ns + passed, restoration.decoder
+                    data = _CONTENT[offer.type_name](self._settings.robot, tick, at, motion)
+                    raw = decoder.encode(restoration.restore(data).message)
+                    yield RawMessage(offer.topic, offer.type_name, at, raw, decoder)
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Publish at the set speed until the duration is over or `stop` is set."""
@@ -138,53 +131,37 @@ class SimSource:
                 return
             emit(message)
 
-    def close(self) -> None:
-        """Nothing is held open."""
 
-
-def _decoder(type_name: str) -> Decoder:
+def _restoration(type_name: str) -> Restoration:
     decoder = decoder_for_known(Wire.ROS1, type_name)
     if decoder is None:
         raise SourceError(f"this version of rosbags does not know {type_name}")
-    return decoder
+    return Restoration(decoder)
 
 
-def _header(types: Any, frame: str, tick: int, stamp_ns: int) -> Any:
-    time = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
-    return types["std_msgs/msg/Header"](tick, time, frame)
+def _odometry(robot: str, tick: int, stamp_ns: int, motion: Motion) -> dict[str, Any]:
+    """Fields that are left out are zero."""
+    position = {"x": motion.x, "y": motion.y}
+    return {
+        "header": {"seq": tick, "stamp": stamp_ns, "frame_id": f"{robot}/odom"},
+        "child_frame_id": f"{robot}/base_link",
+        "pose": {"pose": {"position": position, "orientation": _orientation(motion)}},
+        "twist": {"twist": {"linear": {"x": motion.speed}, "angular": {"z": motion.turn}}},
+    }
 
 
-def _odometry(types: Any, robot: str, tick: int, stamp_ns: int, motion: Motion) -> Any:
-    unknown = numpy.zeros(36)
-    vector = types["geometry_msgs/msg/Vector3"]
-    return types[ODOMETRY](
-        _header(types, f"{robot}/odom", tick, stamp_ns),
-        f"{robot}/base_link",
-        types["geometry_msgs/msg/PoseWithCovariance"](
-            types["geometry_msgs/msg/Pose"](
-                types["geometry_msgs/msg/Point"](motion.x, motion.y, 0.0), _orientation(types, motion)
-            ),
-            unknown,
-        ),
-        types["geometry_msgs/msg/TwistWithCovariance"](
-            types["geometry_msgs/msg/Twist"](vector(motion.speed, 0.0, 0.0), vector(0.0, 0.0, motion.turn)), unknown
-        ),
-    )
+def _imu(robot: str, tick: int, stamp_ns: int, motion: Motion) -> dict[str, Any]:
+    return {
+        "header": {"seq": tick, "stamp": stamp_ns, "frame_id": f"{robot}/imu"},
+        "orientation": _orientation(motion),
+        "angular_velocity": {"z": motion.turn},
+        # Centripetal, and the table that holds it up.
+        "linear_acceleration": {"y": motion.speed * motion.turn, "z": GRAVITY},
+    }
 
 
-def _imu(types: Any, robot: str, tick: int, stamp_ns: int, motion: Motion) -> Any:
-    unknown = numpy.zeros(9)
-    vector = types["geometry_msgs/msg/Vector3"]
-    return types[IMU](
-        _header(types, f"{robot}/imu", tick, stamp_ns),
-        _orientation(types, motion),
-        unknown,
-        vector(0.0, 0.0, motion.turn),
-        unknown,
-        vector(0.0, motion.speed * motion.turn, GRAVITY),  # centripetal, and the table that holds it up
-        unknown,
-    )
+def _orientation(motion: Motion) -> dict[str, float]:
+    return {"z": math.sin(motion.heading / 2), "w": math.cos(motion.heading / 2)}
 
 
-def _orientation(types: Any, motion: Motion) -> Any:
-    return types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(motion.heading / 2), math.cos(motion.heading / 2))
+_CONTENT = {ODOMETRY: _odometry, IMU: _imu}

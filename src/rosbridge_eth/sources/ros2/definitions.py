@@ -13,10 +13,13 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final
 
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Fielddefs
+
 from rosbridge_eth.capture import Decoder, Wire, decoder_for, normalised_type_name
+from rosbridge_eth.capture.definitions import referred, write_text
 from rosbridge_eth.errors import SourceError
 
-_SEPARATOR: Final = "=" * 80
 _BASES: Final = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 """IDL names (OMG IDL 4.2, 7.4.1.4.4.2) that MSG spells otherwise; the sized integers are alike."""
 
@@ -42,17 +45,15 @@ def message_class(type_name: str) -> Any:
 
 def definition_text(type_name: str, class_of: ClassOf = message_class) -> str:
     """The type and all it refers to, in the MSG format with sections. Raises SourceError."""
-    sections: list[str] = []
-    written, open_names = {type_name}, [type_name]
-    while open_names:
-        name = open_names.pop(0)
-        lines, referred = _lines(class_of(name))
-        heading = [] if name == type_name else [_SEPARATOR, f"MSG: {_spelled(name)}"]
-        sections.append("\n".join([*heading, *lines]))
-        new = [part for part in referred if part not in written]
-        written.update(new)
-        open_names += new
-    return "\n".join(sections) + "\n"
+    types: dict[str, Fielddefs] = {}
+    unread = [type_name]
+    while unread:
+        if (name := unread.pop(0)) not in types:
+            generated = class_of(name)
+            kinds = zip(generated.get_fields_and_field_types(), generated.SLOT_TYPES, strict=True)
+            types[name] = [(field, _type(kind)) for field, kind in kinds]
+            unread += [part for _, description in types[name] if (part := referred(description)) is not None]
+    return write_text(type_name, types)
 
 
 def decoder_of(type_name: str, class_of: ClassOf = message_class) -> Decoder:
@@ -60,46 +61,20 @@ def decoder_of(type_name: str, class_of: ClassOf = message_class) -> Decoder:
     return decoder_for(Wire.CDR, type_name, definition_text(type_name, class_of))
 
 
-def _lines(generated: Any) -> tuple[list[str], list[str]]:
-    """The fields' lines, and the messages they refer to, in order, without repetition."""
-    lines: list[str] = []
-    referred: dict[str, None] = {}
-    for name, kind in zip(generated.get_fields_and_field_types(), generated.SLOT_TYPES, strict=True):
-        text, part = _type(kind)
-        lines.append(f"{text} {name}")
-        if part is not None:
-            referred[part] = None
-    return lines, list(referred)
-
-
-def _spelled(name: str) -> str:
-    return name.replace("/msg/", "/")  # as definitions write it
-
-
-def _type(kind: Any) -> tuple[str, str | None]:
-    """A type as MSG writes it, and the message it is or holds. Classes are told by name: rosidl is not imported."""
+def _type(kind: Any) -> Any:
+    """A type in rosbags' tree form. Classes are told by name: rosidl is not imported."""
     match type(kind).__name__:
         case "BasicType":
-            return _BASES.get(kind.typename, kind.typename), None
-        case "UnboundedString":
-            return "string", None
-        case "BoundedString":
-            return f"string<={kind.maximum_size}", None
-        case "UnboundedWString":
-            return "wstring", None
-        case "BoundedWString":
-            return f"wstring<={kind.maximum_size}", None
+            return (Nodetype.BASE, (_BASES.get(kind.typename, kind.typename), 0))
+        case "UnboundedString" | "BoundedString":
+            return (Nodetype.BASE, ("string", getattr(kind, "maximum_size", 0)))
+        case "UnboundedWString" | "BoundedWString":
+            return (Nodetype.BASE, ("wstring", getattr(kind, "maximum_size", 0)))
         case "NamespacedType":
-            name = "/".join(kind.namespaced_name())
-            return _spelled(name), name
+            return (Nodetype.NAME, "/".join(kind.namespaced_name()))
         case "Array":
-            text, part = _type(kind.value_type)
-            return f"{text}[{kind.size}]", part
-        case "UnboundedSequence":
-            text, part = _type(kind.value_type)
-            return f"{text}[]", part
-        case "BoundedSequence":
-            text, part = _type(kind.value_type)
-            return f"{text}[<={kind.maximum_size}]", part
+            return (Nodetype.ARRAY, (_type(kind.value_type), kind.size))
+        case "UnboundedSequence" | "BoundedSequence":
+            return (Nodetype.SEQUENCE, (_type(kind.value_type), getattr(kind, "maximum_size", 0)))
         case other:
             raise SourceError(f"a field of kind {other} is not known here")
