@@ -311,18 +311,17 @@ class Registered(NamedTuple):
 def register_robot(
     home: OperatorHome, name: str, *, ca: CertificateAuthority, keys: Keyring, ledger: Ledger,
     inbox: Callable[[], Inbox], now: datetime, request: Request | None = None, password: bytes | None = None,
-    replace: bool = False, compromised: bool = False, patience: float = SUCCESSION,
-    clock: Callable[[], float] = time.time, pause: Callable[[float], None] = time.sleep,
+    replace: bool = False, compromised: bool = False, pause: Callable[[float], None] = time.sleep,
 ) -> Registered:  # fmt: skip
     """Bind a name to certificates and an account, on the chain and in the registry, and write the bundle.
 
     request: of the robot that made its own keys. Without it they are made here, and the bundle is sealed under
     `password` (the paper's easy_register); whoever made them can sign as the robot.
 
-    replace: take a used name over. The old robot ends first, and for `patience` seconds what it handed over is waited
+    replace: take a used name over. The old robot ends first, and for SUCCESSION seconds what it handed over is waited
     for, since afterwards it would count as written after its end; StoreError if it is not confirmed by then.
-    compromised: it becomes dead letters instead. inbox: opened where there is something to replace; clock, pause: the
-    wall clock. The chain comes before the registry: a crash in between leaves a registration that `replace` replaces.
+    compromised: it becomes dead letters instead. inbox: opened where there is something to replace; pause: waits.
+    The chain comes before the registry: a crash in between leaves a registration that `replace` replaces.
     """
     config, tk = load_server_config(home.config), robot_id(check_name(name))
     if name == OPERATOR:
@@ -345,7 +344,7 @@ def register_robot(
         buried = 0
         if standing.account is not None:
             registry.revoke(Role.ROBOT, name, now)
-            left = 0 if standing.revoked else _waiting(inbox, tk, 0.0 if compromised else patience, clock, pause)
+            left = 0 if standing.revoked else _waiting(inbox, tk, 0.0 if compromised else SUCCESSION, pause)
             if left and not compromised:
                 raise StoreError(
                     f"{left} chunks that the old {name!r} handed to the server are not confirmed on the chain yet, and"
@@ -396,19 +395,15 @@ def _register(
     )
 
 
-def _waiting(
-    inbox: Callable[[], Inbox], tk: bytes, patience: float, clock: Callable[[], float], pause: Callable[[float], None]
-) -> int:
+def _waiting(inbox: Callable[[], Inbox], tk: bytes, patience: float, pause: Callable[[float], None]) -> int:
     """Wait until the server closed the session of a robot out of force, and up to `patience` seconds until what it
     handed over is confirmed; how many chunks are not by then."""
     pause(HANDING_OVER)
-    last = clock() + patience
     with closing(inbox()) as store:
-        while (waiting := store.totals().get(tk)) is not None and waiting.chunks:
-            if clock() >= last:
-                return waiting.chunks
+        while (waiting := store.totals().get(tk)) is not None and waiting.chunks and patience > 0:
             pause(0.2)
-    return 0
+            patience -= 0.2
+    return 0 if waiting is None else waiting.chunks
 
 
 def _bury(inbox: Callable[[], Inbox], ledger: Ledger, tk: bytes, why: str) -> int:
@@ -430,13 +425,12 @@ class Revoked(NamedTuple):
 
 def revoke(
     home: OperatorHome, role: Role, name: str, *, keys: Keyring, ledger: Ledger, inbox: Callable[[], Inbox],
-    now: datetime, compromised: bool = False, patience: float = LAST_WRITES, clock: Callable[[], float] = time.time,
-    pause: Callable[[float], None] = time.sleep,
+    now: datetime, compromised: bool = False, pause: Callable[[float], None] = time.sleep,
 ) -> Revoked:  # fmt: skip
     """Take a name out of force: the server closes its session at once, the contract ends its right to write.
 
     The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
-    of it is given `patience` seconds to be written, none with `compromised`; the rest becomes dead letters.
+    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters.
     ChainError: half done; it is run again when the node answers.
     """
     with Registry(home.registry) as registry:
@@ -455,7 +449,7 @@ def revoke(
             if not in_force:
                 raise IdentityError(nobody)
             return Revoked(None)
-        _waiting(inbox, tk, 0.0 if compromised else patience, clock, pause)
+        _waiting(inbox, tk, 0.0 if compromised else LAST_WRITES, pause)
         buried = _bury(inbox, ledger, tk, f"{name} was revoked")
         return Revoked(ledger.revoke_robot(keys.operator, tk).block, buried)
     except ChainError as error:

@@ -72,13 +72,13 @@ class World:
         options = {"request": None if "password" in options else self.request(name)} | options
         return admin.register_robot(
             self.home, name, ca=load_ca(self.home.ca, PASSPHRASE, NOW), keys=self.keys, ledger=self.ledger,
-            inbox=self.open_inbox, now=NOW, clock=lambda: self.now, pause=self.pause, **options,
+            inbox=self.open_inbox, now=NOW, pause=self.pause, **options,
         )
 
     def revoke(self, name: str = "robot_1", role: Role = Role.ROBOT, **options: Any) -> admin.Revoked:
         return admin.revoke(
             self.home, role, name, keys=self.keys, ledger=self.ledger, inbox=self.open_inbox, now=NOW,
-            clock=lambda: self.now, pause=self.pause, **options,
+            pause=self.pause, **options,
         )
 
     def pause(self, seconds: float) -> None:
