@@ -167,7 +167,9 @@ class Web:
     def _answer(self, environ: Mapping[str, Any], start_response: Any) -> list[bytes]:
         path, registry = environ["PATH_INFO"], collected()
         status, body, kind = HTTPStatus.OK, b"", "application/json"
-        if path == "/metrics":
+        if environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
+            status = HTTPStatus.METHOD_NOT_ALLOWED
+        elif path == "/metrics":
             body, kind = generate_latest(registry), CONTENT_TYPE_LATEST
         elif path in ("/healthz", "/readyz"):
             found = conditions(registry, self._expected, time.time())

@@ -21,7 +21,6 @@ from rich.text import Text
 
 from rosbridge_eth.chunk import Chunk, Log, robot_id
 from rosbridge_eth.config import ServerConfig, load_reader_config, load_robot_config, load_server_config
-from rosbridge_eth.config.values import duration_text
 from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
@@ -267,10 +266,10 @@ def _reader(place: ReaderHome) -> Report:
 
 def span(seconds: float | None) -> str:
     """A length of time in its largest fitting unit."""
-    if seconds is None:
-        return ""
-    unit = next((unit for unit in (86_400, 3600, 60) if seconds >= 2 * unit), 1)
-    return duration_text(float(round(seconds / unit) * unit))
+    for unit, name in (86_400, "d"), (3600, "h"), (60, "m"):
+        if seconds is not None and seconds >= 2 * unit:
+            return f"{round(seconds / unit)}{name}"
+    return "" if seconds is None else f"{round(seconds)}s"
 
 
 def _block(node: Mapping[str, Any] | None) -> tuple[str, object]:

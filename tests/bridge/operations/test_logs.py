@@ -1,4 +1,4 @@
-"""One event is one line, with the record's name; nobody's words make a line of their own, no secret gets out."""
+"""One event is one line; nobody's words make a line of their own, no secret gets out; what is well again is said."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ from collections.abc import Iterator
 import pytest
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.operations.logs import LogFormat, log_to
-from rosbridge_eth.records import RecordId
+from rosbridge_eth.logs import LogFormat, Trouble, log_to, speaks_json
 
-ID = RecordId(bytes(range(32)), bytes(range(16)), 2**63 + 1)
-IN_FULL = f"{bytes(range(32)).hex()}/{bytes(range(16)).hex()}/{2**63 + 1}"
-log = logging.getLogger("rosbridge_eth.server.reception")
+log = logging.getLogger("rosbridge_eth.server")
 
 
 @pytest.fixture(autouse=True)
@@ -34,14 +31,13 @@ def lines(format: LogFormat, verbosity: int = 2) -> io.StringIO:
     return stream
 
 
-def test_json_names_records_in_full_beside_the_short_form():
+def test_json_has_time_level_part_process_and_event():
     stream = lines(LogFormat.JSON)
-    log.info("record %s of %s: stored", ID, "robot robot_1")
+    log.info("%s: chunk %d stored", "robot robot_1", 7)
     event = json.loads(stream.getvalue())
-    assert event["records"] == [IN_FULL]
-    assert event["event"] == f"record {ID} of robot robot_1: stored"
-    assert (event["level"], event["part"]) == ("info", "server.reception")
-    assert event["time"].endswith("Z")
+    assert event["event"] == "robot robot_1: chunk 7 stored"
+    assert (event["level"], event["part"], event["process"]) == ("info", "server", "MainProcess")
+    assert event["time"].endswith("Z") and speaks_json()
 
 
 WORDS = ["a\nb", "a\r\nERROR b", "\x1b[2Ja", "a\u2028b", "\x00", "a\x85b", '"}\n{"level": "x"}']
@@ -77,7 +73,7 @@ def test_a_failure_of_the_bridges_own_says_its_sentence():
     try:
         raise StoreError("the disk is full; make room")
     except StoreError:
-        log.error("records are not taken", exc_info=True)
+        log.error("chunks are not taken", exc_info=True)
     assert "StoreError: the disk is full; make room" in stream.getvalue()
 
 
@@ -91,3 +87,14 @@ def test_verbosity_chooses_how_much_the_bridge_says_and_other_packages_stay_quie
     said = [line.split()[1] for line in stream.getvalue().splitlines() if "ours" in line]
     assert said == levels
     assert stream.getvalue().count("theirs") == 1
+
+
+def test_trouble_is_said_at_each_change_and_so_is_its_end():
+    stream = lines(LogFormat.TEXT, 0)
+    trouble = Trouble(log, "the node")
+    for why in (None, None, "no answer", "no answer", "too slow", None, None, "no answer", None):
+        trouble.now(why)
+        assert trouble.why == why
+    said = [line.partition("server: ")[2] for line in stream.getvalue().splitlines()]
+    assert said == ["the node: no answer", "the node: too slow", "the node: well again", "the node: no answer",
+                    "the node: well again"]  # fmt: skip

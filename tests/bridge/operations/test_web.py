@@ -2,59 +2,68 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
+import os
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
+from rosbridge_eth import metrics
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.operations.board import Board
-from rosbridge_eth.operations.figures import Condition, Snapshot, sample
-from rosbridge_eth.operations.web import AT_ONCE, Web
+from rosbridge_eth.metrics import Web
+
+SLOW = 16
 
 
 @pytest.fixture
-def board() -> Board:
-    made = Board(["robot"])
-    made.put(Snapshot.of("robot", [sample("captured", 3)], [Condition("robot has a session", True)]))
-    return made
-
-
-@pytest.fixture
-def web(board: Board) -> Iterator[Web]:
-    made = Web(("127.0.0.1", 0), board)
+def web() -> Iterator[Web]:
+    made = Web(("127.0.0.1", 0), ["robot"])
+    metrics.beat("robot", time.time())
+    metrics.CONDITION.labels("robot has a session").set(1)
+    metrics.CAPTURED.labels("robot_1").set(3)
     made.start()
     yield made
     made.stop()
+    metrics.CONDITION.clear()
+    metrics.BEAT.clear()
 
 
 def ask(web: Web, path: str, method: str = "GET") -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection(*web.address, timeout=5)
-    try:
+    with contextlib.closing(http.client.HTTPConnection(*web.address, timeout=5)) as connection:
         connection.request(method, path)
         answer = connection.getresponse()
         return answer.status, answer.read()
-    finally:
-        connection.close()
 
 
 def test_metrics_health_and_readiness_are_served(web: Web):
     status, body = ask(web, "/metrics")
-    assert status == 200 and b'rosbridge_eth_captured_total{process="robot"} 3.0' in body
+    assert status == 200 and b'rosbridge_eth_captured{robot="robot_1"} 3.0' in body
     assert ask(web, "/healthz")[0] == 200
     status, body = ask(web, "/readyz?verbose=1")
     assert status == 200 and json.loads(body)["ok"] is True
-    assert ask(web, "/readyz", "HEAD") == (200, b"")
 
 
-def test_what_does_not_hold_is_503_with_the_reason(web: Web, board: Board):
-    board.put(Snapshot.of("robot", [], [Condition("robot has a session", False, "no answer")]))
+def test_what_does_not_hold_is_503_with_its_name(web: Web):
+    metrics.CONDITION.labels("robot has a session").set(0)
     status, body = ask(web, "/readyz")
-    assert status == 503
-    assert {"name": "robot has a session", "ok": False, "says": "no answer"} in json.loads(body)["conditions"]
-    assert ask(web, "/healthz")[0] == 200
+    assert status == 503 and json.loads(body)["conditions"]["robot has a session"] is False
+    assert ask(web, "/healthz")[0] == 200, "it is well, and waits"
+
+
+def test_a_process_that_fell_silent_is_unhealthy(web: Web):
+    metrics.beat("robot", time.time() - metrics.SILENCE - 1)
+    status, body = ask(web, "/healthz")
+    assert status == 503 and json.loads(body)["conditions"] == {"robot runs": False}
+    metrics.BEAT.clear()
+    assert ask(web, "/healthz")[0] == 503, "one that never was there too"
 
 
 @pytest.mark.parametrize("path", ["/", "/metrics/", "/../metrics", "//x/metrics", "/" + "a" * 60_000])
@@ -64,39 +73,75 @@ def test_there_is_nothing_else(web: Web, path: str):
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS"])
 def test_nothing_can_be_written(web: Web, method: str):
-    assert ask(web, "/metrics", method)[0] == 501
+    assert ask(web, "/metrics", method)[0] == 405
 
 
-def test_clients_that_say_nothing_or_nonsense_hold_nobody_up(web: Web):
-    silent = [socket.create_connection(web.address, timeout=5) for _ in range(AT_ONCE - 1)]
+@pytest.mark.parametrize("said", [b"", b"GET /healthz HT", b"GET /healthz HTTP/1.1\r\nX: ", b"\x16\x03\x01 no HTTP"])
+def test_slow_clients_silence_nobody_and_are_shut(web: Web, monkeypatch: pytest.MonkeyPatch, said: bytes):
+    monkeypatch.setattr(metrics, "DEADLINE", 1.0)
+    slow = [socket.create_connection(web.address, timeout=10) for _ in range(SLOW)]
     try:
-        silent[0].sendall(b"\x16\x03\x01 this is no HTTP")
+        for sock in slow:
+            sock.sendall(said)
+        assert ask(web, "/healthz")[0] == 200
+        for sock in slow:  # a byte every now and then does not help
+            with contextlib.suppress(OSError):
+                sock.sendall(b"x")
+        for sock in slow:
+            with contextlib.suppress(ConnectionResetError):
+                while sock.recv(4096):
+                    continue
         assert ask(web, "/healthz")[0] == 200
     finally:
-        for sock in silent:
+        for sock in slow:
             sock.close()
 
 
-def test_more_clients_than_are_served_at_once_are_turned_away_and_it_recovers(web: Web):
-    crowd = [socket.create_connection(web.address, timeout=5) for _ in range(3 * AT_ONCE)]
-    turned_away = 0
-    for sock in crowd[AT_ONCE:]:
-        try:
-            turned_away += sock.recv(1) == b""
-        except ConnectionResetError:
-            turned_away += 1
-    assert turned_away == 2 * AT_ONCE
-    for sock in crowd:
-        sock.close()
-    for _ in range(100):  # until the threads have seen that their clients are gone
-        try:
-            if ask(web, "/healthz")[0] == 200:
-                break
-        except (http.client.HTTPException, ConnectionError):
-            continue
-    assert ask(web, "/healthz")[0] == 200
-
-
-def test_a_port_that_is_taken_is_an_error_that_names_the_key(web: Web, board: Board):
+def test_a_port_that_is_taken_is_an_error_that_names_the_key(web: Web):
     with pytest.raises(NetworkError, match="correct `monitor`"):
-        Web(web.address, board)
+        Web(web.address, [])
+
+
+def test_it_listens_on_ipv6_too():
+    try:
+        made = Web(("::1", 0), [])
+    except NetworkError:
+        pytest.skip("this machine has no IPv6")
+    made.start()
+    assert made.address[0] == "::1"
+    made.stop()
+
+
+def test_nothing_is_shown_before_somebody_has_said_it():
+    script = (
+        "from prometheus_client import generate_latest; from rosbridge_eth import metrics;"
+        " print(generate_latest(metrics.collected()).decode())"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
+                           env={**os.environ, "PYTHONPATH": str(Path(metrics.__file__).parents[1])}).stdout
+    samples = [sample for family in text_string_to_metric_families(shown) for sample in family.samples]
+    assert samples == [], "a server that has no robot's figures rings no robot's alarm"
+
+
+def test_the_command_line_leaves_the_choice_of_the_figures_folder_to_the_server():
+    script = "import sys, rosbridge_eth.cli, rosbridge_eth.supervisor; print('prometheus_client' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
+                          env={**os.environ, "PYTHONPATH": str(Path(metrics.__file__).parents[1])})
+    assert done.stdout == "False\n"
+
+
+def test_processes_share_their_figures_by_a_folder(tmp_path: Path):
+    """A worker that is killed and started again goes on under its name; the newest word of several holds."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(metrics.__file__).parents[1]),
+                   "PROMETHEUS_MULTIPROC_DIR": str(tmp_path)}  # fmt: skip
+    say = "from rosbridge_eth import metrics as m; m.beat('worker-0', {0}); m.SESSION.labels('robot_1', 'a').set({0})"
+    for moment in (10, 20, 15):
+        subprocess.run([sys.executable, "-c", say.format(moment)], check=True, env=environment)
+    script = (
+        "from prometheus_client import generate_latest; from rosbridge_eth import metrics as m;"
+        " print(generate_latest(m.collected()).decode()); print(dict(m.conditions(m.collected(), ['worker-0'], 16)))"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
+    assert 'rosbridge_eth_beat_seconds{process="worker-0"} 15.0' in shown.stdout
+    assert shown.stdout.count("rosbridge_eth_session_seen_seconds{") == 1
+    assert "{'worker-0 runs': True}" in shown.stdout

@@ -1,0 +1,373 @@
+"""`status` shows what is there, names robots, and says what it cannot know; it makes nothing. `check` finds a chunk."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from bridge.chunks import chain as chunk_chain
+from bridge.chunks import dropped
+from bridge.operations.conftest import NODE_SECRETS, PASSWORD, Place
+from bridge.redis_server import RedisServer
+from rosbridge_eth import metrics
+from rosbridge_eth import status as module
+from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.cli import run
+from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.errors import BridgeError, ExitCode
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.robot import open_robot
+from rosbridge_eth.status import Located, locate, span
+
+TK = robot_id("robot_1")
+STREAM = b"s" * 16
+Capture = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
+
+
+def status(capsys: Capture, *arguments: str, code: int = 0) -> dict[str, Any]:
+    assert run(["status", "--json", *arguments]) == code
+    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return report
+
+
+@pytest.fixture
+def on_chain(place: Place, monkeypatch: Patch) -> None:
+    """The node of the home answers."""
+    connect = Ledger.connect
+    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
+
+
+@pytest.fixture
+def write(place: Place, keys: Keyring) -> Callable[..., None]:
+    """Have the chain take these chunks of robot_1, one batch."""
+    account = next(keys.robot(n) for n in range(1, 9)
+                   if keys.robot(n).address == place.ledger.standings([TK])[0].account)  # fmt: skip
+    return lambda *chunks: place.ledger.set_data(account, TK, [chunk.encoded for chunk in chunks]) and None
+
+
+# An operator's home
+
+
+def test_with_node_and_server_away_the_rest_is_shown_and_what_is_not_known_is_said(place: Place, capsys: Capture):
+    inbox = place.inbox()
+    inbox.append([(TK, chunk) for chunk in chunk_chain(3, records=7)], time.time() - 60)
+    inbox.close()
+    before = sorted(place.path.rglob("*"))
+    report = status(capsys)
+    assert [each["name"] for each in report["names"]] == ["server", "owner", "robot_1"]
+    robot = report["robots"]["robot_1"]
+    assert robot["waiting"]["chunks"] == 3 and robot["waiting"]["records"] == 21
+    assert 60 <= robot["waiting"]["oldest"] < 90
+    assert "chunks" not in robot and "connected" not in robot
+    assert report["node"] is None and report["operator"]["eth"] is None
+    said = " ".join(report["unknown"])
+    assert "127.0.0.1:9" in said and "monitor" in said
+    assert run(["status"]) == 0
+    shown = capsys.readouterr()
+    assert "robot_1" in shown.out and "not known" in shown.out and "127.0.0.1:9" in shown.err
+    assert TK.hex()[:8] not in shown.out, "robots are named"
+    assert not any(secret in shown.out + shown.err + json.dumps(report) for secret in NODE_SECRETS)
+    assert [path for path in sorted(place.path.rglob("*")) if path.suffix != ".sqlite-shm"] == [
+        path for path in before if path.suffix != ".sqlite-shm"], "nothing is made"  # fmt: skip
+
+
+def test_accounts_are_on_lines_of_their_own_at_any_width(place: Place, monkeypatch: Patch, capsys: Capture):
+    monkeypatch.setenv("COLUMNS", "40")
+    assert run(["status"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    with Registry(place.operator.registry) as registry:
+        robot = registry.robots()[TK]
+    assert f"{robot.account}  robot_1" in lines and f"{place.operator.account}  operator" in lines
+
+
+def test_without_an_inbox_or_a_contract_it_is_no_trouble(place: Place, capsys: Capture):
+    report = status(capsys)
+    assert not place.operator.inbox.exists() and not any("inbox" in line for line in report["unknown"])
+    place.operator.deployment_file.unlink()
+    report = status(capsys)
+    assert report["contract"] is None and any("deploy" in line for line in report["unknown"])
+
+
+def test_with_the_node_it_shows_what_the_chain_has(
+    place: Place, on_chain: None, write: Callable[..., None], capsys: Capture
+):
+    write(*chunk_chain(3))
+    report = status(capsys)
+    robot = report["robots"]["robot_1"]
+    assert robot["chunks"] == 3 and 0 < robot["eth"] < 1 and robot["revoked_on_chain"] is False
+    assert report["node"]["block"] == place.ledger.block_number()
+    assert report["operator"]["eth"] == place.ledger.balance(place.operator.account) / 10**18
+    assert run(["status"]) == 0
+    assert f"{robot['eth']:.4f}" in capsys.readouterr().out
+
+
+def test_how_long_an_account_lasts_is_what_it_spent_of_late(
+    place: Place, on_chain: None, write: Callable[..., None], capsys: Capture, monkeypatch: Patch
+):
+    tester, chunks = place.chain.ethereum_tester, [*chunk_chain(4)]
+    write(chunks[0])
+    block, then = place.ledger.block_number(), place.ledger.standings([TK])[0].balance
+    tester.time_travel(place.ledger.block().time + 86_400)
+    write(chunks[1])
+    monkeypatch.setattr(module, "SPENDING_BLOCKS", place.ledger.block_number() - block)
+    now = place.ledger.standings([TK])[0].balance
+    days = status(capsys)["robots"]["robot_1"]["days_left"]
+    assert days == pytest.approx(now / (then - now), rel=0.001)
+    write(chunks[2])
+    monkeypatch.setattr(module, "SPENDING_BLOCKS", 0)
+    assert status(capsys)["robots"]["robot_1"]["days_left"] is None, "nothing was spent: nothing is known"
+
+
+def test_what_is_on_hold_or_dead_is_told_with_the_reason(place: Place, capsys: Capture):
+    inbox = place.inbox()
+    inbox.append([(TK, chunk) for chunk in chunk_chain(4)], time.time())
+    inbox.append([(robot_id("stranger"), chunk) for chunk in chunk_chain(2)], time.time())
+    inbox.set_state(TK, hold="the contract refuses")
+    inbox.bury(TK, inbox.rows(TK, None, 1)[0].position, "given up")
+    inbox.close()
+    report = status(capsys)
+    assert report["robots"]["robot_1"]["hold"] == "the contract refuses"
+    assert report["dead"] == [{"robot": "robot_1", "why": "given up", "chunks": 3}]
+    assert report["robots"][robot_id("stranger").hex()]["waiting"]["chunks"] == 2
+    assert run(["status"]) == 0
+    shown = capsys.readouterr().out
+    assert "On hold, robot_1: the contract refuses." in shown and "3 chunks of robot_1: given up" in shown
+
+
+def test_a_revoked_robot_is_shown_as_such(place: Place, capsys: Capture):
+    with Registry(place.operator.registry) as registry:
+        registry.revoke("robot", "robot_1", datetime.now(UTC))
+    assert status(capsys)["robots"]["robot_1"]["in_force"] is False
+    assert run(["status"]) == 0
+    assert "revoked" in capsys.readouterr().out
+
+
+def test_the_node_on_another_chain_is_told_by_the_exit_code_and_the_rest_is_shown(
+    place: Place, keys: Keyring, monkeypatch: Patch, capsys: Capture
+):
+    connect, chain = Ledger.connect, EmbeddedChain({keys.operator.address: 10**20})
+    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(chain, at, **more))
+    report = status(capsys, code=ExitCode.CHAIN)
+    assert "another chain" in report["wrong_chain"] and "chunks" not in report["robots"]["robot_1"]
+    assert run(["status"]) == ExitCode.CHAIN
+    shown = capsys.readouterr()
+    assert "robot_1" in shown.out and "another chain" in shown.err
+    assert status(capsys, "--home", "reader", code=ExitCode.CHAIN)["wrong_chain"]
+
+
+@pytest.mark.service
+def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: Place, tmp_path: Path, capsys: Capture):
+    (tmp_path / "redis").mkdir()
+    redis = RedisServer(tmp_path / "redis")
+    try:
+        url = redis.url.replace("//", "//default:redis-secret@")
+        place.configure("\n[chain]", f'\n[store]\nurl = "{url}"\n[chain]')
+        with redis.client() as client:
+            client.config_set("requirepass", "redis-secret")
+            client.auth("redis-secret")
+            assert "waiting" not in status(capsys)["robots"]["robot_1"]
+            assert client.keys() == []
+            inbox = place.inbox()
+            inbox.append([(TK, chunk) for chunk in chunk_chain(2)], time.time())
+            inbox.close()
+            before = {key: client.dump(key) for key in client.scan_iter()}
+            assert status(capsys)["robots"]["robot_1"]["waiting"]["chunks"] == 2
+            assert {key: client.dump(key) for key in client.scan_iter()} == before
+    finally:
+        redis.kill()
+    report = status(capsys)
+    assert any("Redis" in line for line in report["unknown"]) and "redis-secret" not in json.dumps(report)
+
+
+# Who is connected
+
+
+@pytest.fixture
+def monitored(place: Place) -> SimpleNamespace:
+    web = metrics.Web(("127.0.0.1", 0), ["worker-0"])
+    web.start()
+    place.configure("\n[chain]", f'monitor = "127.0.0.1:{web.address[1]}"\n[chain]')
+    yield SimpleNamespace(web=web)
+    web.stop()
+
+
+def test_who_is_connected_and_from_where_comes_from_the_monitor(
+    place: Place, monitored: SimpleNamespace, capsys: Capture
+):
+    now = time.time()
+    metrics.beat("worker-0", now)
+    metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
+    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
+    metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
+    report = status(capsys)
+    assert report["process"] == [] or all("runs" not in name for name in report["process"])
+    assert (report["robots"]["robot_1"]["connected"], report["robots"]["robot_1"]["address"]) == (True, "192.0.2.2")
+    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
+    robot = status(capsys)["robots"]["robot_1"]
+    assert robot["connected"] is False
+    metrics.CONDITION.labels("node answers").set(0)
+    assert "node answers" in status(capsys)["process"]
+    assert run(["status"]) == 0
+    assert "NOT READY: " in capsys.readouterr().out
+    metrics.CONDITION.labels("node answers").set(1)
+
+
+@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b'{"conditions": []}', b"\xff", b'{"conditions": null}'])
+def test_a_monitor_that_answers_nonsense_is_one_that_does_not_answer(
+    place: Place, monkeypatch: Patch, answer: bytes, capsys: Capture
+):
+    place.configure("\n[chain]", 'monitor = "127.0.0.1:9"\n[chain]')
+    monkeypatch.setattr(module, "ask_monitor", lambda address, path: answer)
+    report = status(capsys)
+    assert report["process"] is None and any("does it run?" in line for line in report["unknown"])
+
+
+# A robot's and a reader's home
+
+
+def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys: Capture):
+    place.robot.config.write_text('topics = ["/robot_1/odom"]\nserver = "192.0.2.1:7410"\n[source]\nkind = "sim"\n')
+    assert status(capsys, "--home", "robot")["spool"] is None
+    assert not place.robot.spool.exists()
+    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+    try:
+        for chunk in chunk_chain(3):
+            robot.spool.append(chunk)
+        report = status(capsys, "--home", "robot")
+        assert (report["kind"], report["robot"], report["runs"], report["spool"]) == ("robot", "robot_1", True, None)
+        assert any("monitor" in line for line in report["unknown"])
+    finally:
+        robot.spool.close()
+        robot.loop.close()
+    report = status(capsys, "--home", "robot")
+    assert report["runs"] is False and report["spool"]["chunks"] == report["spool"]["unstored"] == 3
+    assert run(["status", "--home", "robot"]) == 0
+    shown = capsys.readouterr().out
+    assert "/robot_1/odom" in shown and "192.0.2.1:7410" in shown and "3 chunks" in shown
+
+
+def test_a_running_robot_is_asked_by_its_monitor(place: Place, capsys: Capture):
+    web = metrics.Web(("127.0.0.1", 0), ["robot"])
+    web.start()
+    place.robot.config.write_text(
+        f'topics = ["/robot_1/odom"]\nmonitor = "127.0.0.1:{web.address[1]}"\n[source]\nkind = "sim"\n'
+    )
+    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+    try:
+        metrics.show_robot("robot_1", robot, time.time())
+        report = status(capsys, "--home", "robot")
+        assert "robot has a session" in report["process"]
+        assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
+    finally:
+        robot.spool.close()
+        robot.loop.close()
+        web.stop()
+
+
+def test_a_robot_without_its_bundle_is_told_what_is_next(place: Place, capsys: Capture):
+    place.robot.bridge_file.unlink()
+    assert run(["status", "--home", "robot"]) == ExitCode.CONFIG
+    assert "register" in capsys.readouterr().err
+
+
+def test_a_reader_sees_its_nodes(place: Place, monkeypatch: Patch, capsys: Capture):
+    report = status(capsys, "--home", "reader")
+    assert report["kind"] == "reader" and report["nodes"] == [] and "127.0.0.1:9" in report["unknown"][0]
+    connect = Ledger.connect
+    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
+    assert status(capsys, "--home", "reader")["nodes"][0]["block"] == place.ledger.block_number()
+
+
+def test_follow_looks_again_until_it_is_interrupted(place: Place, monkeypatch: Patch, capsys: Capture):
+    looks: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        looks.append(seconds)
+        if len(looks) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module.time, "sleep", sleep)
+    assert run(["status", "--follow"]) == 130
+    assert len(looks) == 3 and "robot_1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("seconds, says", [
+    (None, ""), (0, "0s"), (1.4, "1s"), (119, "119s"), (125, "2m"), (7199, "120m"), (7201, "2h"), (86_400, "24h"),
+    (200_000, "2d"),
+])
+def test_a_span_is_short(seconds: float | None, says: str):
+    assert span(seconds) == says
+
+
+# check
+
+
+def test_a_chunk_is_found_where_it_is_stored_written_confirmed_dead_or_nowhere(
+    place: Place, write: Callable[..., None], capsys: Capture
+):
+    def find(number: int, stream: bytes = STREAM) -> Located:
+        return locate(place.operator, place.ledger, "robot_1", stream.hex(), number)
+
+    chunks = [*chunk_chain(6)]
+    assert find(0) == Located("unknown")
+    inbox = place.inbox()
+    inbox.append([(TK, chunk) for chunk in chunks], time.time())
+    assert find(0) == find(5) == Located("stored")
+    assert find(6) == find(0, b"t" * 16) == Located("unknown")
+    write(*chunks[:2])
+    write(*chunks[2:4])
+    block = place.ledger.block_number()
+    events = [*place.ledger.data_events(TK, 0, block)]
+    assert find(1) == Located("confirmed", "0x" + events[0].transaction.hex(), block - 1, True)
+    assert find(2) == Located("confirmed", "0x" + events[1].transaction.hex(), block, True)
+    assert find(4) == Located("stored")
+    place.configure("\n[chain]", "\n[chain]\nconfirmations = 2")
+    assert (find(1).state, find(2).state) == ("confirmed", "written")
+    inbox.bury(TK, inbox.find(TK, place.ledger.standings([TK])[0].tail), "given up")
+    assert find(4) == Located("dead letter")
+    inbox.close()
+    for file in place.path.glob("operator/inbox.sqlite*"):
+        file.unlink()
+    assert find(2).state == "written", "the chain alone is enough"
+    assert find(4) == Located("unknown")
+
+
+def test_the_dropped_form_of_a_chunk_is_that_chunk(place: Place, write: Callable[..., None]):
+    first, second = chunk_chain(2)
+    write(dropped(first), second)
+    assert locate(place.operator, place.ledger, "robot_1", STREAM.hex(), 0).proven is True
+
+
+def test_a_chunk_is_asked_for_by_a_name_that_is_enrolled_and_a_stream_that_is_one(
+    place: Place, on_chain: None, write: Callable[..., None], capsys: Capture
+):
+    def check(*arguments: str) -> int:
+        return run(["check", *arguments])
+
+    assert check("robot_9", STREAM.hex(), "1") == ExitCode.IDENTITY
+    assert "no robot 'robot_9' is enrolled; `status` lists" in capsys.readouterr().err
+    for wrong in ("zz", "0f" * 15, "0f" * 17, "0f " * 16, "é" * 32):
+        assert check("robot_1", wrong, "1") == ExitCode.CONFIG
+        assert "the stream is 32 hex digits" in capsys.readouterr().err
+    assert check("robot_1", STREAM.hex(), "0") == ExitCode.VERIFICATION
+    assert capsys.readouterr().out == "unknown\n"
+    write(*chunk_chain(1))
+    assert check("robot_1", STREAM.hex(), "0") == 0
+    assert "the contract says true" in capsys.readouterr().out
+    assert check("robot_1", STREAM.hex().upper(), "0", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["state"] == "confirmed" and found["proven"] is True and found["transaction"].startswith("0x")
+
+
+def test_status_may_be_imported_by_itself():
+    assert issubclass(module.ConfigError, BridgeError)
