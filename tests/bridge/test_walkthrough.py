@@ -35,7 +35,7 @@ def test_the_walkthrough_runs_as_it_is_written(tmp_path: Path, require: Callable
     )
     # The commands in the background hold the pipes open, so the shell's end is waited for, not theirs.
     try:
-        code = process.wait(timeout=200)
+        code = process.wait(timeout=270)
     finally:
         os.killpg(process.pid, signal.SIGTERM)
     out, err = process.communicate(timeout=20)
@@ -47,5 +47,7 @@ def test_the_walkthrough_runs_as_it_is_written(tmp_path: Path, require: Callable
     analysts = [json.loads(line) for line in (tmp_path / "analyst.jsonl").read_text().splitlines()]
     assert len(analysts) == 50, "the second run alone was sealed for the second reader"
     assert not {r["proof"]["stream"] for r in analysts} & {r["proof"]["stream"] for r in records}
+    assert len((tmp_path / "records.csv").read_text().splitlines()) == 51, "fifty records and the heads"
+    assert (tmp_path / "recovered.mcap").stat().st_size > 5_000
     assert (tmp_path / "trajectory.png").stat().st_size > 5_000
     assert "revoked" in out
