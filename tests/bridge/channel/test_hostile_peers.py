@@ -327,6 +327,18 @@ def test_an_address_that_is_not_proven_gets_at_most_three_bytes_for_one():
     assert not [e for e in events(steps.server) if isinstance(e, AddressChanged)]
 
 
+def test_not_even_a_farewell_goes_where_nothing_more_may_go():
+    steps = connected()
+    [packet] = sent(steps, b"x")
+    steps.server.receive_datagram(packet, ELSEWHERE, steps.now)
+    steps.server.datagrams_to_send(steps.now)
+    [connection] = steps.server._connections.values()
+    connection.allowance = 30  # a farewell has 31 bytes
+    steps.server.close(steps.now)
+    assert steps.server.datagrams_to_send(steps.now) == []
+    assert isinstance(events(steps.server)[-1], Disconnected)
+
+
 def test_who_copies_packets_from_elsewhere_and_is_faster_loses_the_session_again_with_the_clients_next_packet():
     steps = connected()
     [connection] = steps.server._connections.values()
