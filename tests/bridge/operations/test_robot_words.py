@@ -1,0 +1,124 @@
+"""What a robot says of itself: why it has no session and what to do, and at the end what became of everything."""
+
+from __future__ import annotations
+
+import logging
+import re
+from datetime import UTC, datetime
+from functools import partial
+
+import pytest
+
+from bridge.operations.conftest import PASSWORD, Place
+from rosbridge_eth import robot as module
+from rosbridge_eth.channel import ClientConfig, HandshakeFailed, Reason
+from rosbridge_eth.config import Address, load_robot_config
+from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.robot import Robot, open_robot
+from rosbridge_eth.sources import sample_bag
+
+NO_SERVER = 'server = "127.0.0.1:9"\n'
+BAG = '[source]\nkind = "bag"\npath = "BAG"\nspeed = "max"\n'
+ODOM = 'topics = ["/robot_1/odom"]\n'
+Logged = pytest.LogCaptureFixture
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that gives a handshake half a second."""
+    monkeypatch.setattr(module, "ClientConfig", partial(ClientConfig, attempt_timeout=0.5))
+
+
+def opened(place: Place, text: str) -> Robot:
+    place.robot.config.write_text(text.replace("BAG", str(sample_bag())))
+    return open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+
+
+def run_to_the_sources_end(robot: Robot) -> str:
+    robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() and not robot._ring else None)
+    return robot.summary
+
+
+def warnings(caplog: Logged) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_a_reason_is_said_with_its_mend_and_at_most_once_a_minute(place: Place, caplog: Logged) -> None:
+    robot = opened(place, NO_SERVER + ODOM + BAG)
+    for now in range(0, 121, 5):
+        robot.sender.handle(HandshakeFailed("it is silent"), now)
+        robot.sender.handle(HandshakeFailed("it refuses", Reason.NOT_ALLOWED), now)
+    robot.spool.close()
+    robot.loop.close()
+    said = warnings(caplog)
+    assert [sum(why in line for line in said) for why in ("it is silent", "it refuses")] == [3, 3]
+    assert all("register --replace" in line and "join" in line for line in said if "it refuses" in line)
+    assert all('channel = "exchange"' in line for line in said if "it is silent" in line)
+
+
+def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
+    place: Place, server: Address, impatient: None, caplog: Logged
+) -> None:
+    with Registry(place.operator.registry) as registry:
+        registry.revoke("robot", "robot_1", datetime.now(UTC))
+    robot = opened(place, place.robot.config.read_text())
+    robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal and robot.chunks else None)
+    for text in (robot.summary, " ".join(warnings(caplog))):
+        assert "register --replace" in text
+    assert re.search(r"[1-9]\d* chunks kept for later", robot.summary)
+
+
+def test_a_mode_that_the_server_may_not_take_is_named(
+    place: Place, server: Address, impatient: None, caplog: Logged
+) -> None:
+    robot = opened(place, 'channel = "transport"\n' + place.robot.config.read_text())
+    robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal else None)
+    [said] = warnings(caplog)
+    assert 'channel = "transport"' in said
+
+
+def test_a_robot_that_is_stopped_before_any_answer_says_so(place: Place) -> None:
+    line = run_to_the_sources_end(opened(place, NO_SERVER + ODOM + BAG))
+    assert re.search(r"^\d+ records captured in \d+ chunks, [1-9]\d* chunks kept for later: there was no session", line)
+
+
+def test_the_sum_counts_what_was_left_out(place: Place) -> None:
+    robot = opened(place, f'''{NO_SERVER}
+topics = ["/robot_1/odom"]
+[[topics]]
+topic = "/robot_1/imu"
+[capture]
+oversize = "refuse"
+field_limit = 1
+{BAG}'''.replace('topics = ["/robot_1/odom"]\n', ""))
+    line = run_to_the_sources_end(robot)
+    seen = sum(topic.seen for topic in robot.capture.statistics().values())
+    left_out = re.search(r"(\d+) messages left out as too large or undecodable", line)
+    assert line.startswith("0 records captured") and left_out is not None and int(left_out[1]) == seen > 0
+
+
+@pytest.mark.parametrize("topic, source, says", [
+    ('at = "2099-01-01T00:00:00Z"', "", "/robot_1/odom: `at` leaves nothing"),
+    ('from = "2099-01-01T00:00:00Z"', "", "/robot_1/odom: `from` leaves nothing"),
+    ('until = "1999-01-01T00:00:00Z"', "", "/robot_1/odom: `until` leaves nothing"),
+    ("", 'start = "2h"', "start = 7200s is after its last message; the recording lasts"),
+    ('at = "1999-01-01T00:00:00Z"', 'start = "100ms"', None),
+])
+def test_a_moment_outside_the_recording_is_remarked(
+    place: Place, topic: str, source: str, says: str | None, caplog: Logged
+) -> None:
+    rule = ", ".join(['topic = "/robot_1/odom"', *([topic] if topic else [])])
+    line = run_to_the_sources_end(opened(place, f"{NO_SERVER}topics = [{{{rule}}}]\n{BAG}{source}\n"))
+    assert line.startswith("0 records captured") == (says is not None)
+    said = warnings(caplog)
+    assert (len(said) == 1 and says in said[0]) if says is not None else said == []
+    if topic and says:
+        assert re.search(r"from 20\d\d-\d\d-\d\dT\S+Z to 20\d\d-", said[0])
+
+
+def test_without_a_source_and_without_ros_nothing_is_invented(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("ROS_VERSION", "ROS_DISTRO", "ROS_MASTER_URI"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigError, match=r"\[source\]"):
+        opened(place, ODOM)
