@@ -167,7 +167,9 @@ class Registry:
         return _enrolment(*row) if row else None
 
     def allows(self, peer: PeerIdentity) -> bool:
-        """Is this very certificate the one in force for the name?"""
+        """Is this very certificate the one in force for the name? StoreError as `revision`: asked of a registry that
+        was exchanged, a revocation would never be heard of."""
+        self.revision()
         found = self.find(peer.role, peer.name)
         return found is not None and found.fingerprint == peer.signing_certificate.fingerprint()
 

@@ -289,6 +289,7 @@ class Supervisor:
         }  # fmt: skip
         beats = Beats()
         while not asked():
+            registry.revision()  # StoreError where it was exchanged: this process ends, the next one opens it anew
             wait = FIRST_PAUSE
             try:
                 wait = submitter.turn(time.time())
