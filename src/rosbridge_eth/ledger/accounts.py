@@ -14,10 +14,12 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_private, seal_box, write_atomically
+from rosbridge_eth.ledger.transport import limit_recursion
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
@@ -26,6 +28,14 @@ FORMAT = "rosbridge-eth accounts 2"
 WORDS = 24
 MIN_SEED, MAX_SEED = 16, 64  # bytes, BIP-32
 _MNEMONIC, _RAW = b"mnemonic", b"raw"
+
+
+def _derivation() -> ModuleType:
+    """eth_account's key derivation (BIP-32, 39, 44), imported where it is first needed."""
+    from eth_account import hdaccount
+
+    limit_recursion()
+    return hdaccount
 
 
 class Keyring:
@@ -42,20 +52,18 @@ class Keyring:
     @staticmethod
     def create() -> Keyring:
         """A new mnemonic of 24 words from the system's generator."""
-        from eth_account.hdaccount import generate_mnemonic
         from eth_account.types import Language
 
-        return Keyring(_MNEMONIC, generate_mnemonic(WORDS, Language.ENGLISH).encode())
+        return Keyring(_MNEMONIC, _derivation().generate_mnemonic(WORDS, Language.ENGLISH).encode())
 
     @staticmethod
     def from_mnemonic(words: str) -> Keyring:
         """BIP-39, any of its lengths; IdentityError if a word or the checksum is wrong."""
-        from eth_account.hdaccount import ETHEREUM_DEFAULT_PATH, key_from_seed, seed_from_mnemonic
         from eth_utils.exceptions import ValidationError
 
-        normal = " ".join(words.split())
+        normal, derivation = " ".join(words.split()), _derivation()
         try:
-            key_from_seed(seed_from_mnemonic(normal, ""), ETHEREUM_DEFAULT_PATH)
+            derivation.key_from_seed(derivation.seed_from_mnemonic(normal, ""), derivation.ETHEREUM_DEFAULT_PATH)
         except (ValidationError, ValueError):
             raise IdentityError("this is no BIP-39 mnemonic: a word is unknown or the checksum wrong") from None
         return Keyring(_MNEMONIC, normal.encode())
@@ -74,19 +82,20 @@ class Keyring:
 
     @cached_property
     def _seed(self) -> bytes:
-        from eth_account.hdaccount import seed_from_mnemonic
-
-        return self._secret if self._kind == _RAW else seed_from_mnemonic(self._secret.decode(), "")
+        if self._kind == _RAW:
+            return self._secret
+        seed: bytes = _derivation().seed_from_mnemonic(self._secret.decode(), "")
+        return seed
 
     def account(self, number: int) -> LocalAccount:
         """m/44'/60'/0'/0/number."""
         from eth_account import Account
-        from eth_account.hdaccount import key_from_seed
 
         if not 0 <= number < 2**31:
             raise IdentityError(f"an account's number is in [0, 2**31), not {number}")
         if number not in self._accounts:
-            self._accounts[number] = Account.from_key(key_from_seed(self._seed, f"m/44'/60'/0'/0/{number}"))
+            key = _derivation().key_from_seed(self._seed, f"m/44'/60'/0'/0/{number}")
+            self._accounts[number] = Account.from_key(key)
         return self._accounts[number]
 
     @property
