@@ -1,0 +1,299 @@
+"""A server and a robot as processes on a real node: what they show and log, how they say they are ill, how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from bridge.secrecy import betrayed, leaves
+from rosbridge_eth.errors import ExitCode
+from rosbridge_eth.home import OperatorHome
+from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.sources import sample_bag
+
+ROOT = Path(__file__).resolve().parents[3]
+PASSPHRASE, PASSWORD, READERS = "operators-words-4711", "robots-words-0815", "readers-words-2342"
+PATIENCE = 60.0
+pytestmark = [pytest.mark.service, pytest.mark.slow]
+
+
+def free_port(kind: int) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def ask(port: int, path: str) -> tuple[int, bytes]:
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=5)) as connection:
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+
+
+def figures_at(port: int) -> dict[str, float]:
+    """Sums over the processes."""
+    found: dict[str, float] = {}
+    for family in text_string_to_metric_families(ask(port, "/metrics")[1].decode()):
+        for one in family.samples:
+            key = one.name.removeprefix("rosbridge_eth_")
+            key += "".join(f" {value}" for label, value in sorted(one.labels.items()) if label != "process")
+            found[key] = found.get(key, 0) + one.value
+    return found
+
+
+@dataclass
+class Bridge:
+    """A home, a node and a server that runs; the logs are files."""
+
+    path: Path
+    node_port: int
+    monitor: int
+    anvil: Anvil
+    server: subprocess.Popen[bytes] | None = None
+    environment: dict[str, str] = field(default_factory=dict)
+
+    def command(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "rosbridge_eth", *arguments]
+
+    def do(self, *arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(self.command(*arguments), cwd=self.path, env=self.environment, text=True,
+                              capture_output=True, timeout=100, check=False)
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        return done
+
+    def start(self, log: str, *arguments: str) -> subprocess.Popen[bytes]:
+        with (self.path / log).open("ab") as stream:
+            return subprocess.Popen(self.command(*arguments, "-vv", "--log-format", "json"), cwd=self.path,
+                                    env=self.environment, stderr=stream)  # fmt: skip
+
+    def start_server(self) -> None:
+        self.server = self.start("server.log", "server", "--workers", "2", "--passphrase-file", "pass")
+
+    def start_robot(self, source: str, more: str = "") -> subprocess.Popen[bytes]:
+        (self.path / "robot/robot.toml").write_text(f'topics = ["/robot_1/odom"]\n{more}[source]\n{source}\n')
+        return self.start("robot.log", "robot", "--password-file", "word")
+
+    def start_anvil(self) -> None:
+        self.anvil = Anvil.start(self.node_port, state=self.path / "chain.json")
+
+    def until(self, what: str, holds: Callable[[], bool]) -> None:
+        """Wait for the processes; they have no clock of ours."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            with contextlib.suppress(OSError, http.client.HTTPException, KeyError):
+                if holds():
+                    return
+            time.sleep(0.2)
+        raise AssertionError(f"{what} within {PATIENCE:.0f} s; readyz: {ask(self.monitor, '/readyz')}")
+
+    def ready(self) -> bool:
+        return ask(self.monitor, "/readyz")[0] == 200
+
+    def figures(self) -> dict[str, float]:
+        return figures_at(self.monitor)
+
+    def events(self, log: str) -> list[dict[str, object]]:
+        return [json.loads(line) for line in (self.path / log).read_text().splitlines()]
+
+    def said(self, log: str, words: str) -> int:
+        return sum(words in str(event["event"]) for event in self.events(log))
+
+    def pid(self, name: str) -> int:
+        starts = [str(event["event"]) for event in self.events("server.log")
+                  if str(event["event"]).startswith(f"{name} started")]  # fmt: skip
+        return int(starts[-1].rpartition(" ")[2])
+
+
+@pytest.fixture(scope="module", name="bridge")
+def _bridge(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]) -> Iterator[Bridge]:
+    require("npx")
+    path, node, udp, monitor = (
+        tmp_path_factory.mktemp("processes"), free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM),
+        free_port(socket.SOCK_STREAM),
+    )
+    made = Bridge(path, node, monitor, Anvil.start(node, state=path / "chain.json"))
+    made.environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    made.environment.pop("PROMETHEUS_MULTIPROC_DIR", None)
+    try:
+        for name, words in (("pass", PASSPHRASE), ("word", PASSWORD), ("readers", READERS)):
+            (path / name).write_text(words)
+        made.do("init", "--listen", f"127.0.0.1:{udp}", "--chain", f"http://127.0.0.1:{node}",
+                "--passphrase-file", "pass", "--reader-passphrase-file", "readers")
+        config = path / "operator" / "server.toml"
+        config.write_text(config.read_text().replace("[chain]", f'monitor = "127.0.0.1:{monitor}"\n\n[chain]'))
+        made.anvil.fund(OperatorHome(path / "operator").account, 1000)
+        made.do("deploy", "--wait", "60", "--passphrase-file", "pass")
+        made.do("join", "--name", "robot_1", "--password-file", "word")
+        made.do("register", "robot_1", "robot/request.json", "--passphrase-file", "pass")
+        made.do("join", "operator/bundles/robot_1.bundle")
+        made.start_server()
+        yield made
+    finally:
+        if made.server is not None and made.server.poll() is None:
+            made.server.terminate()
+            made.server.wait(30)
+        made.anvil.stop()
+
+
+def test_the_figures_of_a_run_are_those_of_the_run(bridge: Bridge):
+    bridge.until("ready", bridge.ready)
+    robot = bridge.start_robot(f'kind = "bag"\npath = "{sample_bag()}"\nspeed = "max"')
+    assert robot.wait(100) == 0
+    lines = 302  # the bag's 300 messages, the line that opens the stream and the one that defines their type
+    bridge.until("everything stored", lambda: bridge.figures()["records_stored robot_1"] == lines)
+    bridge.until("something sent", lambda: bridge.figures()["submitter sent"] >= 1)
+    bridge.until("everything confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
+    figures = bridge.figures()
+    report = json.loads(bridge.do("status", "--json").stdout)
+    assert figures["chunks stored"] == report["robots"]["robot_1"]["chunks"] > 0
+    assert figures["channel handshakes"] == 1
+    assert figures["on_hold robot_1"] == figures["waiting_bytes robot_1"] == figures["waiting_seconds robot_1"] == 0
+    assert figures["treasury_eth"] == pytest.approx(report["operator"]["eth"], abs=1)
+    assert report["process"] == []
+    bridge.until("the last block", lambda: bridge.figures()["head_block"] == report["node"]["block"])
+
+
+def test_logs_at_their_most_talkative_name_every_chunk_and_betray_nothing(bridge: Bridge):
+    read = bridge.do("read", "robot_1", "--passphrase-file", "readers").stdout
+    records = [json.loads(line) for line in read.splitlines()]
+    assert len(records) == 300
+    verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
+    assert bridge.said("robot.log", verdict["head"]["stream"]) > 0
+    secrets = {PASSPHRASE.encode(), PASSWORD.encode(), READERS.encode(), b"/robot_1/odom", b"nav_msgs"}
+    for record in records[::10]:
+        secrets |= {text.encode() for text in map(str, leaves(record["data"])) if len(text) >= 8}
+    assert len(secrets) > 100
+    for key in bridge.path.rglob("*.key.pem"):
+        secrets |= {line for line in key.read_bytes().splitlines() if len(line) > 40 and b"-----" not in line}
+    for log in ("server.log", "robot.log"):
+        content = (bridge.path / log).read_bytes()
+        assert len(content) > 500
+        assert betrayed(content, secrets) == []
+
+
+def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: Bridge):
+    port = free_port(socket.SOCK_STREAM)
+    robot = bridge.start_robot('kind = "sim"', f'monitor = "127.0.0.1:{port}"\n')
+    try:
+        bridge.until("ready", lambda: ask(port, "/readyz")[0] == 200)
+        bridge.until("captured", lambda: figures_at(port)["captured robot_1"] > 10)
+        assert figures_at(port)["connected robot_1"] == 1
+        assert "treasury_eth" not in figures_at(port), "a robot says nothing of what the server knows"
+        bridge.until("seen", lambda: json.loads(bridge.do("status", "--json").stdout)["robots"]["robot_1"]["connected"])
+        assert json.loads(bridge.do("status", "--json").stdout)["robots"]["robot_1"]["address"] == "127.0.0.1"
+        assert json.loads(bridge.do("status", "--home", "robot", "--json").stdout)["figures"]["connected"] == 1
+        findings = json.loads(bridge.do("doctor", "--passphrase-file", "pass", "--json").stdout)["findings"]
+        assert next(f["found"] for f in findings if f["what"] == "UDP port").startswith("a server answers")
+        findings = json.loads(bridge.do("doctor", "--home", "robot", "--json").stdout)["findings"]
+        assert {f["what"]: f["result"] for f in findings}["server"] == "skipped"
+        assert {f["what"]: f["result"] for f in findings}["monitor"] == "ok"
+    finally:
+        robot.send_signal(signal.SIGHUP)
+    assert robot.wait(30) == 0, "SIGHUP is an orderly end"
+    assert bridge.said("robot.log", "records captured in") == 2
+    bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
+    verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
+    assert verdict["sound"] and verdict["head"]["goodbye"]
+
+
+def test_a_killed_worker_is_started_again_and_counted(bridge: Bridge):
+    bridge.until("ready", bridge.ready)
+    before = bridge.figures()["starts"]
+    os.kill(bridge.pid("worker-1"), signal.SIGKILL)
+    bridge.until("counted", lambda: bridge.figures()["starts"] == before + 1)
+    bridge.until("up again", bridge.ready)
+    assert bridge.said("server.log", "worker-1 ended with exit code -9") == 1
+
+
+def test_a_worker_that_hangs_makes_it_unhealthy(bridge: Bridge):
+    bridge.until("ready", bridge.ready)
+    worker = bridge.pid("worker-0")
+    os.kill(worker, signal.SIGSTOP)
+    try:
+        bridge.until("unhealthy", lambda: ask(bridge.monitor, "/healthz")[0] == 503)
+        assert json.loads(ask(bridge.monitor, "/healthz")[1])["conditions"]["worker-0 runs"] is False
+    finally:
+        os.kill(worker, signal.SIGCONT)
+    bridge.until("ready again", bridge.ready)
+
+
+def test_a_node_that_is_away_makes_it_unready_but_not_unhealthy_and_its_return_is_logged(bridge: Bridge):
+    bridge.until("ready at first", bridge.ready)
+    bridge.anvil.stop()
+
+    def blames_the_node() -> bool:
+        status, body = ask(bridge.monitor, "/readyz")
+        return status == 503 and json.loads(body)["conditions"]["node answers"] is False
+
+    bridge.until("unready", blames_the_node)
+    assert ask(bridge.monitor, "/healthz")[0] == 200
+    report = json.loads(bridge.do("status", "--json").stdout)
+    assert report["process"] == ["node answers"] and report["node"] is None
+    bridge.start_anvil()
+    bridge.until("ready again", bridge.ready)
+    bridge.until("said so", lambda: bridge.said("server.log", "the node: well again") == 1)
+    assert bridge.said("server.log", "the node: http://127.0.0.1") >= 1
+
+
+def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bridge):
+    bridge.until("ready at first", bridge.ready)
+    bridge.anvil.stop()
+    before = bridge.figures()["starts"]
+    os.kill(bridge.pid("submitter"), signal.SIGKILL)
+    bridge.until("started again", lambda: bridge.figures()["starts"] > before)
+    bridge.until("unready", lambda: not bridge.ready())
+    bridge.start_anvil()
+    bridge.until("ready again", bridge.ready)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Bridge, number: signal.Signals):
+    assert bridge.server is not None
+    bridge.until("ready at first", bridge.ready)
+    children = [bridge.pid(name) for name in ("worker-0", "worker-1", "submitter", "monitor")]
+    bridge.server.send_signal(number)
+    assert bridge.server.wait(30) == ExitCode.OK
+    assert all({"time", "level", "part", "process", "event"} <= event.keys() for event in bridge.events("server.log"))
+    assert bridge.said("server.log", "does not end; it is killed") == 0
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
+    bridge.start_server()
+
+
+def test_children_of_a_killed_server_end_by_themselves(bridge: Bridge):
+    assert bridge.server is not None
+    bridge.until("ready at first", bridge.ready)
+    children = [bridge.pid(name) for name in ("worker-0", "worker-1", "submitter", "monitor")]
+    bridge.server.kill()
+    bridge.server.wait(10)
+    bridge.until("gone", lambda: not any(Path(f"/proc/{child}").exists() for child in children))
+    bridge.start_server()
+    bridge.until("ready again", bridge.ready)
+
+
+def test_a_port_that_is_taken_is_told_at_the_start(bridge: Bridge):
+    assert bridge.server is not None
+    bridge.until("ready at first", bridge.ready)
+    said = bridge.do("server", "--passphrase-file", "pass", code=ExitCode.NETWORK).stderr
+    assert "UDP port" in said, "two servers do not share one port"
+    bridge.server.terminate()
+    bridge.server.wait(30)
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections of before linger
+        taken.bind(("127.0.0.1", bridge.monitor))
+        taken.listen()
+        said = bridge.do("server", "--passphrase-file", "pass", code=ExitCode.NETWORK).stderr
+    assert "correct `monitor`" in said
