@@ -11,7 +11,7 @@ ROS 1 has no authentication: whoever reaches the network can publish. What is pr
 caller of our API can make the bridge crash, wait, or use more memory than was set.
 """
 
-from rosbridge_eth.sources.ros1.publisher import Cause, TopicCounters
+from rosbridge_eth.sources.ros1.publisher import Cause
 from rosbridge_eth.sources.ros1.source import Ros1Settings, Ros1Source
 
-__all__ = ["Cause", "Ros1Settings", "Ros1Source", "TopicCounters"]
+__all__ = ["Cause", "Ros1Settings", "Ros1Source"]

@@ -20,6 +20,7 @@ import logging
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -30,7 +31,7 @@ from rosbridge_eth.sources.backlog import Backlog
 from rosbridge_eth.sources.protocol import Clock, Offer
 from rosbridge_eth.sources.ros1 import api
 from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError, bind_host, own_host, uri_of
-from rosbridge_eth.sources.ros1.publisher import FAILURES, LAST_RETRY, Cause, Publisher, TopicCounters
+from rosbridge_eth.sources.ros1.publisher import FAILURES, LAST_RETRY, Cause, Publisher
 from rosbridge_eth.sources.ros1.tcpros import ANY, Publication
 from rosbridge_eth.sources.selection import RESOLVE_EVERY, Selection
 
@@ -64,7 +65,7 @@ class Node(threading.Thread):
 
     def __init__(
         self, master: Endpoint, host: str | None, name: str, selection: Selection, backlog: Backlog,
-        counters: dict[str, TopicCounters], clock: Clock, *, max_message: int, timeout: float,
+        counts: Counter[tuple[str, str]], clock: Clock, *, max_message: int, timeout: float,
     ) -> None:  # fmt: skip
         super().__init__(name="ros1", daemon=True)
         self.caller_id, self.timeout = name, timeout
@@ -72,11 +73,11 @@ class Node(threading.Thread):
         self.failure: BaseException | None = None
         self._base_name, self._renamed = name, 0
         self._master, self._host, self._selection = master, host, selection
-        self._backlog, self._counters, self._clock = backlog, counters, clock
+        self._backlog, self._counts, self._clock = backlog, counts, clock
         self._max_message, self._arriving = max_message, 0
         self._topics: dict[str, _Topic] = {}
         self._publishers: set[Publisher] = set()  # whose threads have not ended
-        self._lock = threading.RLock()  # of what is above and of the counters; never held during a call
+        self._lock = threading.RLock()  # of what is above and of the counts; never held during a call
         self._rung, self._leaving = threading.Event(), threading.Event()
         self._uri = ""
         self._named = self._answers = self._looked = False
@@ -265,9 +266,7 @@ class Node(threading.Thread):
                         f"{known.node} publishes {known.type_name} ({known.md5})"
                     )
             publisher.publication = publication
-            counters = self._counters_of(publisher.topic)
-            counters.connections += 1
-            counters.connected += 1
+            self._counts[publisher.topic, "connected"] += 1
         log.info("%s: reading %s from %s", publisher.topic, publication.type_name, publication.node or publisher.uri)
 
     def make_room(self, length: int) -> bool:
@@ -286,20 +285,17 @@ class Node(threading.Thread):
             with self._lock:
                 self._arriving -= length
 
-    def received(self, topic: str, publication: Publication, body: bytes, *, latched: bool) -> None:
+    def received(self, topic: str, publication: Publication, body: bytes) -> None:
         """A message is complete."""
         received_ns = self._clock.wall_ns()
         with self._lock:
-            counters = self._counters_of(topic)
-            counters.received += 1
-            counters.bytes += len(body)
-            counters.latched += latched
+            self._counts[topic, "received"] += 1
         self._backlog.put(RawMessage(topic, publication.type_name, received_ns, body, publication.decoder))
 
     def passed_over(self, publisher: Publisher, length: int) -> None:
         """A message is not read."""
         with self._lock:
-            self._counters_of(publisher.topic).too_large += 1
+            self._counts[publisher.topic, "too_large"] += 1
         self._say(
             f"too large {publisher.topic}",
             f"{publisher.topic}: a message of {length} bytes is left out; at most {self._max_message} bytes of a "
@@ -310,8 +306,7 @@ class Node(threading.Thread):
         """A connection was not made, or was lost, or was ended by us for what came."""
         with self._lock:
             connected, publisher.publication = publisher.publication is not None, None
-            counters = self._counters_of(publisher.topic)
-            counters.connected -= connected
+            self._counts[publisher.topic, "connected"] -= connected
             if publisher.over.is_set():
                 return
             if isinstance(error, ProtocolError):
@@ -320,7 +315,7 @@ class Node(threading.Thread):
                 cause = Cause.REFUSED
             else:
                 cause = Cause.CLOSED if connected else Cause.UNREACHABLE
-            counters.ended[cause] += 1
+            self._counts[publisher.topic, cause] += 1
             if (topic := self._topics.get(publisher.topic)) is not None:
                 topic.rung = True  # it may have started anew somewhere else
         text = f"{publisher.topic}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
@@ -338,9 +333,6 @@ class Node(threading.Thread):
             if topic is not None and topic.publishers.get(publisher.uri) is publisher:
                 del topic.publishers[publisher.uri]
                 topic.rung = True
-
-    def _counters_of(self, topic: str) -> TopicCounters:
-        return self._counters.setdefault(topic, TopicCounters())
 
     def _say(self, key: str, text: str | None) -> None:
         """For the log, once for each key; None as text: it is over, say it anew the next time."""

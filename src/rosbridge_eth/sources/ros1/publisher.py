@@ -5,22 +5,12 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.ros1 import api
+from rosbridge_eth.sources.ros1 import api, tcpros
 from rosbridge_eth.sources.ros1.addressing import read_uri
-from rosbridge_eth.sources.ros1.tcpros import (
-    Publication,
-    pass_over,
-    read_exactly,
-    read_header,
-    read_length,
-    read_publication,
-    request_header,
-)
 
 if TYPE_CHECKING:
     from rosbridge_eth.sources.ros1.node import Node
@@ -37,7 +27,6 @@ FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError)
 """What a peer can bring about: it says what is wrong, is gone or silent, or has a name that is none."""
 
 
-
 class Cause(StrEnum):
     """Why a connection to a publisher ended, or was not made."""
 
@@ -45,27 +34,6 @@ class Cause(StrEnum):
     CLOSED = "closed"  # by the publisher, in good order as far as one can see
     REFUSED = "refused"  # the publisher will not, or cannot be recorded: another type, no definition, a bad one
     PROTOCOL = "protocol"  # what it sent is not TCPROS or XML-RPC
-
-
-@dataclass(slots=True)
-class TopicCounters:
-    """Of one topic, since the source was opened.
-
-    received: messages read completely; each is emitted, still waiting, or dropped.
-    dropped: messages given up because those before them were not taken fast enough.
-    too_large: messages above the size that is read.
-    latched: messages received as the first of a connection to a latching publisher, so perhaps not for the first time.
-    connected: publishers read from now. connections: headers accepted so far. ended: by cause.
-    """
-
-    received: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    too_large: int = 0
-    latched: int = 0
-    connected: int = 0
-    connections: int = 0
-    ended: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(Cause, 0))
 
 
 class Publisher(threading.Thread):
@@ -77,7 +45,7 @@ class Publisher(threading.Thread):
     def __init__(self, node: Node, topic: str, uri: str) -> None:
         super().__init__(name=f"ros1 {topic}", daemon=True)
         self.topic, self.uri = topic, uri
-        self.publication: Publication | None = None
+        self.publication: tcpros.Publication | None = None
         self.kept = False
         self.over = threading.Event()
         self._node = node
@@ -119,26 +87,24 @@ class Publisher(threading.Thread):
             if self.over.is_set():
                 return
             with node.deadlines.within(sock, node.timeout):
-                sock.sendall(request_header(topic, node.caller_id))
-                publication = read_publication(topic, read_header(stream))
+                sock.sendall(tcpros.request_header(topic, node.caller_id))
+                publication = tcpros.read_publication(topic, tcpros.read_header(stream))
             node.admit(self, publication)
             self._read(sock, stream, publication)
 
-    def _read(self, sock: socket.socket, stream: BinaryIO, publication: Publication) -> None:
-        first = publication.latching
+    def _read(self, sock: socket.socket, stream: BinaryIO, publication: tcpros.Publication) -> None:
         while True:
-            length = read_length(stream)  # until then, silence is no fault
+            length = tcpros.read_length(stream)  # until then, silence is no fault
             with self._node.deadlines.within(sock, STALLED + length / SLOWEST):
-                self._take(stream, length, publication, latched=first)
-            first = False
+                self._take(stream, length, publication)
 
-    def _take(self, stream: BinaryIO, length: int, publication: Publication, *, latched: bool) -> None:
+    def _take(self, stream: BinaryIO, length: int, publication: tcpros.Publication) -> None:
         if not self._node.make_room(length):
             self._node.passed_over(self, length)
-            pass_over(stream, length)
+            tcpros.pass_over(stream, length)
             return
         try:
-            self._node.received(self.topic, publication, read_exactly(stream, length), latched=latched)
+            self._node.received(self.topic, publication, tcpros.read_exactly(stream, length))
         finally:
             self._node.free_room(length)
 

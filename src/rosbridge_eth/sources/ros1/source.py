@@ -8,16 +8,15 @@ Publishers are never held up.
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
-from rosbridge_eth.capture import Decoder
 from rosbridge_eth.sources.backlog import Backlog
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
 from rosbridge_eth.sources.ros1.addressing import master_endpoint, node_name
 from rosbridge_eth.sources.ros1.node import Node, ask_offers
-from rosbridge_eth.sources.ros1.publisher import TopicCounters
 from rosbridge_eth.sources.selection import Selection
 
 TAKE_PATIENCE = 0.1
@@ -42,7 +41,7 @@ class Ros1Settings:
     timeout: float = 5.0
 
 
-class Ros1Source:
+class Ros1Source(Source):
     """The chosen topics of a master. It waits for a master that is not there yet; nothing is asked before `run`."""
 
     kind = "ros1"
@@ -55,24 +54,13 @@ class Ros1Source:
         self._master = master_endpoint(settings.master)
         self._name = node_name(settings.node)
         self._closed = threading.Event()
-        self._counters: dict[str, TopicCounters] = {}
+        self.counts: Counter[tuple[str, str]] = Counter()
+        """By topic: messages received and too_large; publishers connected now; connections ended, by Cause."""
         self._backlog = Backlog(settings.waiting, 2 * settings.max_message)
 
     def offers(self) -> Sequence[Offer]:
         """What is published now, asked of the master. Raises SourceError."""
         return ask_offers(self._master, self._name, self._settings.timeout)
-
-    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
-        """None: types are known when publishers are connected."""
-        return {}
-
-    def statistics(self) -> Mapping[str, TopicCounters]:
-        """By topic, as of now; from any thread."""
-        dropped = self._backlog.dropped
-        return {
-            topic: replace(counters, dropped=dropped.get(topic, 0), ended=dict(counters.ended))
-            for topic, counters in list(self._counters.items())
-        }
 
     @property
     def dropped(self) -> Mapping[str, int]:
@@ -85,7 +73,7 @@ class Ros1Source:
         Raises SourceError.
         """
         node = Node(
-            self._master, self._settings.hostname, self._name, self._selection, self._backlog, self._counters,
+            self._master, self._settings.hostname, self._name, self._selection, self._backlog, self.counts,
             self._clock, max_message=self._settings.max_message, timeout=self._settings.timeout,
         )  # fmt: skip
         node.start()

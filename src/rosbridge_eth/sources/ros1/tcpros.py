@@ -41,7 +41,6 @@ class Publication:
     type_name: str
     md5: str
     decoder: Decoder
-    latching: bool
     node: str
 
 
@@ -126,7 +125,7 @@ def read_publication(topic: str, fields: Mapping[str, str]) -> Publication:
         raise ProtocolError(f"{fields['md5sum'][:60]!r} is not an md5 sum")
     name = normalised_type_name(fields["type"])
     decoder = _decoder(name, md5, fields.get("message_definition", ""))
-    return Publication(name, md5, decoder, fields.get("latching") == "1", fields.get("callerid", "")[:256])
+    return Publication(name, md5, decoder, fields.get("callerid", "")[:256])
 
 
 def _decoder(name: str, md5: str, text: str) -> Decoder:

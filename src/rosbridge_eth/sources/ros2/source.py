@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final
@@ -23,7 +24,7 @@ from typing import Any, ClassVar, Final
 from rosbridge_eth.capture import Decoder, RawMessage
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.backlog import Backlog
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, SystemClock
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
 from rosbridge_eth.sources.ros2.definitions import decoder_of, message_class
 from rosbridge_eth.sources.ros2.quality import Quality, most_that_all_offer, quality_of
 from rosbridge_eth.sources.ros2.rclpy_parts import first_line, import_rclpy, name_of, take, type_hash_of
@@ -61,20 +62,6 @@ class Ros2Settings:
     depth: int = 256
 
 
-@dataclass(frozen=True, slots=True)
-class TopicCounts:
-    """Messages of a topic so far.
-
-    lost: did not reach this process (best effort, or faster than the queue of `depth` was emptied).
-    dropped: reached it, but the robot was too slow. foreign: of a publisher with another definition of the type.
-    """
-
-    received: int = 0
-    lost: int = 0
-    dropped: int = 0
-    foreign: int = 0
-
-
 @dataclass
 class _Topic:
     """A watched topic: its subscription and what is known of its publishers."""
@@ -93,12 +80,9 @@ class _Topic:
     last_seen: float = 0.0
     sequence: dict[bytes, int] = field(default_factory=dict)
     numbered: bool = False  # whether the middleware says publisher and number of a message
-    received: int = 0
-    lost: int = 0
-    left_out: int = 0
 
 
-class Ros2Source:
+class Ros2Source(Source):
     """The watched topics of one ROS 2 graph. Its own rclpy context: no signal handler is set, no argument read."""
 
     kind = "ros2"
@@ -108,6 +92,9 @@ class Ros2Source:
         """Joins the graph. Raises SourceError if rclpy is not there or cannot."""
         self._settings, self._selection, self._clock = settings, selection, clock or SystemClock()
         self._backlog = Backlog()
+        self.counts: Counter[tuple[str, str]] = Counter()
+        """By topic, messages received; lost, which did not reach this process (best effort, or faster than the queue of
+        `depth` was emptied); foreign, of a publisher with another definition of the type."""
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._unusable: set[tuple[str, str]] = set()
         self._said: set[tuple[str, str]] = set()
@@ -144,9 +131,6 @@ class Ros2Source:
         """The topics that somebody publishes now, without hidden ones. Discovery takes a second or two."""
         return self._read_graph()[0]
 
-    def decoders(self) -> Mapping[str, Sequence[Decoder]]:
-        return {}
-
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit what arrives until `stop` is set or the source is closed. Raises SourceError."""
         if not self._open or self._receiving is not None:
@@ -181,19 +165,6 @@ class Ros2Source:
             self._executor.shutdown(timeout_sec=STOP_TIME)
             self._node.destroy_node()
             self._context.try_shutdown()
-
-    def statistics(self) -> Mapping[str, TopicCounts]:
-        """By topic."""
-        topics = list(self._topics.values())
-        dropped = self._backlog.dropped
-        counts: dict[str, TopicCounts] = {}
-        for name in dict.fromkeys(topic.offer.topic for topic in topics):
-            types = [topic for topic in topics if topic.offer.topic == name]
-            received, lost, foreign = (
-                sum(getattr(topic, count) for topic in types) for count in ("received", "lost", "left_out")
-            )
-            counts[name] = TopicCounts(received, lost, dropped.get(name, 0), foreign)
-        return counts
 
     @property
     def dropped(self) -> Mapping[str, int]:
@@ -395,7 +366,7 @@ class Ros2Source:
             found = self._node.get_publishers_info_by_topic(offer.topic)
             self._know(topic, [endpoint for endpoint in found if endpoint.topic_type == offer.type_name])
         if topic.foreign and (publisher is None or publisher in topic.foreign):
-            topic.left_out += 1
+            self.counts[topic.offer.topic, "foreign"] += 1
             return
         number = info.get("publication_sequence_number")
         if publisher is not None and number is not None:
@@ -406,14 +377,14 @@ class Ros2Source:
             topic.sequence[publisher] = number
             if last is not None and number > last + 1:
                 self._lost(topic, number - last - 1)
-        topic.received += 1
+        self.counts[topic.offer.topic, "received"] += 1
         received_ns = info.get("received_timestamp") or self._clock.wall_ns()
         self._backlog.put(RawMessage(topic.offer.topic, topic.offer.type_name, received_ns, raw, topic.decoder))
 
     # What a person is told, once
 
     def _lost(self, topic: _Topic, count: int) -> None:
-        topic.lost += count
+        self.counts[topic.offer.topic, "lost"] += count
         if self._first(topic.offer.topic, "lost"):
             why = "a larger depth in [source] may help" if topic.quality.reliable else "its publisher is best effort"
             name = topic.offer.topic

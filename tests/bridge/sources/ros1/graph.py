@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule
 from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros1 import Ros1Settings, Ros1Source
+from rosbridge_eth.sources.ros1 import Cause, Ros1Settings, Ros1Source
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
 PUBLISHERS = Path(__file__).with_name("publishers.py")
@@ -163,8 +163,7 @@ class Listening:
 
     def ended(self, topic: str) -> int:
         """Attempts to connect, and connections, that came to nothing."""
-        counters = self.source.statistics().get(topic)
-        return sum(counters.ended.values()) if counters else 0
+        return sum(self.source.counts[topic, cause] for cause in Cause)
 
     def numbers(self, topic: str) -> list[int]:
         return [data["data"] for data in self.data.get(topic, ())]

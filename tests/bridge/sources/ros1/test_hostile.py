@@ -90,8 +90,7 @@ def test_publishers_that_are_none_are_left_counted_said_once_and_tried_again(mas
     with closing_all(*hostile.values()), Listening(master.uri, [*topics.values(), "/good"]) as listening:
         for name, (_, cause) in BAD_HEADERS.items():
             eventually(lambda name=name: hostile[name].data.connections >= 3, f"{name}: it is tried again")
-            statistics = listening.source.statistics()[topics[name]]
-            assert statistics.ended[cause] >= 2, (name, statistics)
+            assert listening.source.counts[topics[name], cause] >= 2, (name, listening.source.counts)
             assert listening.count(topics[name]) == 0, name
         still_heard(listening)
     for name, topic in topics.items():
@@ -128,9 +127,9 @@ def test_nodes_that_answer_nonsense_or_are_none_are_tried_again(master):
     with closing_all(*hostile.values()), Listening(master.uri, [*topics.values(), "/nowhere", "/good"]) as listening:
         for name, peer in hostile.items():
             eventually(lambda peer=peer: peer.connections >= 3, f"{name}: it is tried again")
-            assert sum(listening.source.statistics()[topics[name]].ended.values()) >= 2, name
+            assert listening.ended(topics[name]) >= 2, name
         still_heard(listening)
-        assert sum(listening.source.statistics()["/nowhere"].ended.values()) >= len(BAD_URIS)
+        assert listening.ended("/nowhere") >= len(BAD_URIS)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +145,7 @@ def test_a_publisher_that_never_finishes_its_header_is_given_up(master, conversa
     with closing_all(hostile), Listening(master.uri, ["/t", "/good"], timeout=0.3) as listening:
         eventually(lambda: peer.connections >= 2, "it is given up and tried again")
         still_heard(listening)
-        assert sum(listening.source.statistics()["/t"].ended.values()) >= 1
+        assert listening.ended("/t") >= 1
 
 
 def test_a_publisher_that_stops_within_a_message_is_given_up(master, monkeypatch):
@@ -167,7 +166,7 @@ def test_one_type_for_a_topic_at_a_time(master):
     with closing_all(first, other), Listening(master.uri, ["/t", "/good"]) as listening:
         listening.wait_for("/t", 3)
         master.publishers["/t"] = [first.uri, other.uri]
-        eventually(lambda: listening.source.statistics()["/t"].ended[Cause.REFUSED], "the other type is refused")
+        eventually(lambda: listening.source.counts["/t", Cause.REFUSED], "the other type is refused")
         still_heard(listening)
         assert {raw.type_name for raw in listening.raw if raw.topic == "/t"} == {"std_msgs/msg/UInt64"}
 
@@ -183,7 +182,7 @@ def test_messages_that_do_not_fit_their_definition_do_not_end_anything(master):
         listening.wait_for("/t", 1)
         assert listening.data["/t"] == [{"data": "ok"}]
         assert listening.capture.statistics()["/t"].undecodable == len(bad)
-        assert listening.source.statistics()["/t"].connected == 1
+        assert listening.source.counts["/t", "connected"] == 1
         still_heard(listening)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 import pytest
@@ -71,7 +72,7 @@ def begun(monkeypatch):
 
 def scripted(patch: pytest.MonkeyPatch, *topics: str, nodes: tuple[str, ...] = ()) -> Script:
     subject = Node(
-        Endpoint("m", 1), None, "/me", Selection(topics, nodes), Backlog(), {}, SystemClock(),
+        Endpoint("m", 1), None, "/me", Selection(topics, nodes), Backlog(), Counter(), SystemClock(),
         max_message=1 << 20, timeout=1.0,
     )  # fmt: skip
     subject._uri = API
@@ -93,7 +94,7 @@ def connected(script: Script, topic: str) -> list[str]:
 
 def read_from(publisher: Publisher) -> None:
     """As if its header had been accepted."""
-    publisher.publication = Publication("a/msg/B", "0" * 32, None, False, "/n")  # type: ignore[arg-type]
+    publisher.publication = Publication("a/msg/B", "0" * 32, None, "/n")  # type: ignore[arg-type]
 
 
 def test_a_named_topic_is_registered_before_anybody_publishes_it(make):

@@ -14,7 +14,6 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 from rosbridge_eth.capture import (
@@ -70,5 +69,9 @@ try:
 except SourceError as error:
     say({"error": str(error)})
     sys.exit(error.exit_code)
-say({"statistics": {topic: asdict(counts) for topic, counts in source.statistics().items()}})
+statistics: dict[str, dict[str, int]] = {}
+for topic in dict.fromkeys(topic for topic, _ in source.counts):
+    counts = {what: source.counts[topic, what] for what in ("received", "lost", "foreign")}
+    statistics[topic] = counts | {"dropped": source.dropped.get(topic, 0)}
+say({"statistics": statistics})
 say({"threads": [thread.name for thread in threading.enumerate()]})
