@@ -29,7 +29,7 @@ from rosbridge_eth.channel import (
 from rosbridge_eth.channel.session import RECEIVE_SEGMENTS
 from rosbridge_eth.channel.wire import SEGMENT_SIZE
 
-SEEDS = int(os.environ.get("CHANNEL_SEEDS", "200"))
+SEEDS = int(os.environ.get("CHANNEL_SEEDS", "100"))
 FIRST = int(os.environ.get("CHANNEL_FIRST_SEED", "0"))
 SIZES = (0, 1, 17, 300, 540, 800, 1153, 1154, 1155, 1161, 1162, 1163, 2500, 9000)
 LONGEST = 72 * 1024 - 4
@@ -180,7 +180,7 @@ def test_a_useful_rate_is_kept_at_thirty_per_cent_loss(round_trip, loss, least):
     """kB/s over the first 30 seconds; NewReno keeps 20, 5 and 2."""
     network = Network(5, Faults(loss=loss, delay=round_trip / 2, jitter=round_trip / 10))
     hub = ServerProgram(network)
-    robot = RobotProgram(network, [bytes(8192)] * 400)
+    robot = RobotProgram(network, [bytes(8192)] * 250)
     network.run(lambda: robot.sent is not None)
     began = network.now
     network.run(lambda: robot.done, limit=30.0)
