@@ -30,15 +30,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import clique
+from eth_utils.crypto import keccak
 
-from rosbridge_eth import ledger
-from rosbridge_eth.ledger import anvil
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.chain import Call
-from rosbridge_eth.ledger.contract import Contract, calldata
-from rosbridge_eth.ledger.failures import NodeFailure
-from rosbridge_eth.ledger.transactions import Fees, Transaction, sign
-from rosbridge_eth.records import RecordId, SealedRecord, robot_id
+from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.contract import NOTHING, Receipt, call_gas, set_data_gas
+from rosbridge_eth.ledger.nodes import Anvil
 
 PROCESSES, WRITES, QUERIES, CONFIRMATIONS = 8, 4, 4, 3
 ETH = 10**18
@@ -56,29 +53,26 @@ def network(kind: str, clients: int, period: int) -> Iterator[list[str]]:
                 running.await_blocks(3)
                 yield [node.url for node in running.nodes]
         else:
-            with anvil.start(clique.free_ports(1)[0], block_time=period) as node:
-                chain = ledger.connect(node.url)
-                chain.request("anvil_setBalance", KEYS.operator.address, hex(10_000 * ETH))
+            with Anvil.start(clique.free_ports(1)[0], block_time=period) as node:
+                node.fund(KEYS.operator.address, 10_000)
                 for client in range(1, clients + 1):  # some of them are those that anvil makes rich
-                    chain.request("anvil_setBalance", KEYS.robot(client).address, "0x0")
-                chain.close()
+                    node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")
                 yield [node.url]
 
 
 class Requests:
     """Transactions of some accounts, followed until they are confirmed."""
 
-    def __init__(self, contract: Contract, times: Times) -> None:
-        self._contract, self._chain, self._times = contract, contract.chain, times
+    def __init__(self, ledger: Ledger, times: Times) -> None:
+        self._ledger, self._times = ledger, times
         self._sent: dict[bytes, float] = {}
-        self._id, self._fees = self._chain.chain_id(), Fees.suggested(self._chain.head(), self._chain.priority_fee())
+        self._fees = ledger.fees(ledger.block())
 
-    def send(self, account: object, nonce: int, data: bytes, value: int = 0) -> None:
-        gas = self._chain.estimate_gas(Call(self._contract.address, data, account.address, value)) * 5 // 4
-        signed = sign(Transaction(self._id, nonce, self._contract.address, data, gas, self._fees, value), account)
+    def send(self, account: object, nonce: int, data: bytes, gas: int, value: int = 0) -> None:
+        signed = self._ledger.sign(account, data, nonce=nonce, gas=gas, fees=self._fees, value=value)
         before = time.perf_counter()
-        [answer] = self._chain.send([signed.raw])
-        if isinstance(answer, NodeFailure):
+        [refused] = self._ledger.send([signed.raw])
+        if refused is not None:
             self._times["refused"].append(0.0)
             return
         self._sent[signed.hash] = time.perf_counter()
@@ -86,19 +80,19 @@ class Requests:
 
     def settle(self) -> None:
         """Until all are confirmed, or it took too long."""
-        waiting, included = dict(self._sent), {}
+        waiting, included = dict(self._sent), dict[bytes, tuple[Receipt, float]]()
         self._sent.clear()
         deadline = time.monotonic() + PATIENCE
         while (waiting or included) and time.monotonic() < deadline:
-            for hash, receipt in zip(list(waiting), self._chain.receipts(list(waiting)), strict=True):
-                if receipt is not None:
+            for hash in list(waiting):
+                if (receipt := self._ledger.receipt(hash)) is not None:
                     now = time.perf_counter()
                     self._times["include"].append(now - waiting.pop(hash))
                     included[hash] = receipt, now
-            head = self._chain.head().number
+            head = self._ledger.block_number()
             for hash, (receipt, since) in list(included.items()):
-                if head >= receipt.block_number + CONFIRMATIONS - 1:
-                    [now_in] = self._chain.receipts([hash])
+                if head >= receipt.block + CONFIRMATIONS - 1:
+                    now_in = self._ledger.receipt(hash)
                     self._times["confirm"].append(time.perf_counter() - since)
                     self._times["written" if now_in and now_in.succeeded else "failed"].append(0.0)
                     del included[hash]
@@ -106,47 +100,45 @@ class Requests:
         self._times["late"] += [0.0] * (len(waiting) + len(included))
 
 
-def record(client: int, number: int) -> SealedRecord:
-    id = RecordId(robot_id(f"client_{client}"), bytes(16), number)
-    return SealedRecord(id, (f"{client}/{number} ".encode() * 64)[:256])
+def record(client: int, number: int) -> bytes:
+    return (f"{client}/{number} ".encode() * 64)[:256]
 
 
 def write_and_ask(url: str, address: str, clients: list[int]) -> Times:
     """One of the eight processes."""
     times: Times = defaultdict(list)
-    chain = ledger.connect(url)
-    contract = Contract.at(chain, address)
-    requests = Requests(contract, times)
+    ledger = Ledger(url, address)
+    requests = Requests(ledger, times)
     for number in range(WRITES):
         for client in clients:
-            sealed = record(client, number)
-            data = calldata("setData", sealed.id.robot, number, sealed.id.stream, number, sealed.ciphertext)
-            requests.send(KEYS.robot(client), number, data)
+            tail = keccak(record(client, number - 1)) if number else NOTHING
+            data = ledger.calldata("setData", robot_id(f"client_{client}"), number, tail, [record(client, number)])
+            requests.send(KEYS.robot(client), number, data, set_data_gas([256]))
         requests.settle()
     for number in range(QUERIES):
         for client in clients:
+            chunk = record(client, number)
             before = time.perf_counter()
-            found = contract.check_data(record(client, number), number, 0, 1, ())
+            found = ledger.check_data(robot_id(f"client_{client}"), number, [keccak(chunk)], 0, chunk)
             times["query"].append(time.perf_counter() - before)
             times["answered" if found else "denied"].append(0.0)
-    chain.close()
+    ledger.close()
     return dict(times)
 
 
 def measure(kind: str, clients: int, period: int) -> dict[str, Times]:
     """{"registration": ..., "use": ...}."""
     with network(kind, clients, period) as urls:
-        chain = ledger.connect(urls[0])
-        contract = ledger.deploy(chain, KEYS.operator)
+        ledger, _ = Ledger.deploy(urls[0], KEYS.operator)
         times: Times = defaultdict(list)
-        requests, nonce = Requests(contract, times), chain.nonce(KEYS.operator.address)
+        requests, nonce = Requests(ledger, times), ledger.nonces([KEYS.operator.address])[0][0]
         # Each registration first: money goes to registered accounts alone, and not above 5 ETH.
         for function, value in (("registration", 0), ("allocETH", ETH // 10)):
             for client in range(1, clients + 1):
                 address = KEYS.robot(client).address
-                data = (calldata(function, robot_id(f"client_{client}"), address, b"certificates")
-                        if function == "registration" else calldata(function, address))
-                requests.send(KEYS.operator, nonce, data, value)
+                data = (ledger.calldata(function, robot_id(f"client_{client}"), address, b"certificates")
+                        if function == "registration" else ledger.calldata(function, address))
+                requests.send(KEYS.operator, nonce, data, call_gas(data), value)
                 nonce += 1
             requests.settle()
             if function == "registration":
@@ -154,7 +146,7 @@ def measure(kind: str, clients: int, period: int) -> dict[str, Times]:
         shares = [list(range(1 + process, clients + 1, PROCESSES)) for process in range(PROCESSES)]
         with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
             parts = pool.starmap(write_and_ask, [
-                (urls[number % len(urls)], contract.address, share) for number, share in enumerate(shares) if share
+                (urls[number % len(urls)], ledger.contract, share) for number, share in enumerate(shares) if share
             ])
         use: Times = defaultdict(list)
         for part in parts:

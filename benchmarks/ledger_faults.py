@@ -448,6 +448,7 @@ def main(arguments: list[str] | None = None, say: Callable[[str], None] = print)
     options = parser.parse_args(arguments)
     if options.submit:
         submit(*options.submit)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the node ends, too
     first, _, end = options.seeds.partition(":")
     wrong, total = [], Counter[str]()
     for seed in range(int(first), int(end)):

@@ -36,8 +36,10 @@ class EmbeddedChain(EthereumTesterProvider):
     Every transaction gets a block at once. Safe to use from several threads.
     """
 
-    def __init__(self, fund: Mapping[str, int] | None = None, *, gas_limit: int = 30_000_000) -> None:
-        """fund: wei of these accounts at the beginning."""
+    def __init__(
+        self, fund: Mapping[str, int] | None = None, *, gas_limit: int = 30_000_000, rules: Any = None
+    ) -> None:
+        """fund: wei of these accounts at the beginning. rules: a VM class of py-evm, Prague's otherwise."""
         from eth_tester import EthereumTester, PyEVMBackend  # type: ignore[import-untyped, unused-ignore]
         from eth_utils.address import to_canonical_address
 
@@ -46,7 +48,8 @@ class EmbeddedChain(EthereumTesterProvider):
             to_canonical_address(account): {"balance": wei, "nonce": 0, "code": b"", "storage": {}}
             for account, wei in wealth.items()
         }
-        backend = PyEVMBackend(PyEVMBackend.generate_genesis_params({"gas_limit": gas_limit}), state)
+        genesis = PyEVMBackend.generate_genesis_params({"gas_limit": gas_limit})
+        backend = PyEVMBackend(genesis, state, rules and ((0, rules),))
         super().__init__(EthereumTester(backend))
         limit_recursion()  # py-evm wants more for calls within calls 1,024 deep; the contract here makes none
         self._lock = threading.RLock()

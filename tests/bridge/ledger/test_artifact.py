@@ -51,3 +51,13 @@ def test_the_code_fits_a_contract_and_needs_no_opcode_after_paris():
         opcode = code[position]
         assert opcode not in (0x5F, 0x5C, 0x5D, 0x5E, 0x49, 0x4A)  # PUSH0, TLOAD, TSTORE, MCOPY, BLOBHASH, BLOBBASEFEE
         position += 1 + (opcode - 0x5F if 0x60 <= opcode <= 0x7F else 0)
+
+
+def test_the_page_has_the_gas_of_this_code():
+    spec = importlib.util.spec_from_file_location("contracts_document", CONTRACTS / "document.py")
+    assert spec is not None
+    assert spec.loader is not None
+    document = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(document)
+    page = document.PAGE.read_text("utf-8")
+    assert document.drawn(page) == page
