@@ -19,7 +19,8 @@ class Line:
     """A client whose packets nobody gets; `acknowledge` says the contrary of some of them."""
 
     def __init__(self) -> None:
-        self.steps = Steps(client=make_client(1000.0, ClientConfig(patience=1000.0, patience_max=1000.0))).until_connected()
+        patient = ClientConfig(patience=1000.0, patience_max=1000.0)
+        self.steps = Steps(client=make_client(1000.0, patient)).until_connected()
         self.session = self.steps.client._session
         self.now = 1000.0
         self.acknowledge([0], round_trip=0.1)  # FINISHED; its round trip is the first sample

@@ -1,4 +1,4 @@
-"""Makes transcripts.json beside it: a whole handshake of each mode and a message, with every secret that went into them.
+"""Makes transcripts.json beside it: a whole handshake of each mode and a message, with every secret in them.
 
 Run from the repository: PYTHONPATH=src:tests python tests/vectors/channel/make_transcripts.py
 
