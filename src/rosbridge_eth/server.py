@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 TURN = 0.05  # seconds that chunks are gathered for one commit
 LOOK_EVERY = 1.0  # seconds between looks at what the submitter and the operator changed
 HELD = 5.0  # seconds before a robot that was told to hold is asked to go on
+WELL_AFTER = 3 * HELD  # seconds without a chunk to try it with, after which a store that answers counts as well
 LONGEST_WAIT = 0.5
 ALIVE = 10.0  # seconds after its last message in which a session counts as alive
 MISMATCH = "the contract has other certificates for this robot; the operator's `status` says more"
@@ -78,6 +79,7 @@ class Reception:
         self.counts: Counter[str] = Counter()
         self.records: Counter[str] = Counter()
         self.trouble = Trouble(log, "the inbox")
+        self._failed_at = float("-inf")
 
     # From the channel
 
@@ -161,6 +163,7 @@ class Reception:
             self.commit(now, wall)
         if now >= self._look_at:
             self._look_at = now + LOOK_EVERY
+            self._append([], now, wall)
             self.look(now)
 
     def _enough(self) -> bool:
@@ -172,16 +175,8 @@ class Reception:
         asked, self._asked = self._asked, []
         for session in self.sessions.values():
             session.offers = []
-        try:
-            chunks = [(session.tk, chunk) for session, chunk in gathered]
-            outcomes = self._inbox.append(chunks, wall) if chunks else []
-            self.trouble.now(None)
-        except InboxExchanged as error:  # what robots were told is void: they ask again in a new session
-            log.error("%s; all sessions begin anew", error)
-            self.server.close(now)
-            return
-        except StoreError as error:
-            self.trouble.now(str(error))
+        outcomes = self._append([(session.tk, chunk) for session, chunk in gathered], now, wall)
+        if outcomes is None:
             self._hold([*asked, *(session for session, _ in gathered)], "the server's store is away", now)
             return
         answers: dict[int, Session] = {id(session): session for session in asked}
@@ -189,6 +184,23 @@ class Reception:
             self._take_outcome(session, chunk, outcome, answers, now)
         for session in answers.values():
             self._say_stored(session, now)
+
+    def _append(self, chunks: list[tuple[bytes, Chunk]], now: float, wall: float) -> list[Outcome] | None:
+        """Without chunks only asks whether the store is there, and the same. None where nothing was taken."""
+        try:
+            outcomes = self._inbox.append(chunks, wall)
+        except InboxExchanged as error:  # what robots were told is void: they ask again in a new session
+            log.error("%s; all sessions begin anew", error)
+            self.server.close(now)
+            self.sessions.clear()
+            return None
+        except StoreError as error:
+            self._failed_at = now if chunks else self._failed_at
+            self.trouble.now(str(error))
+            return None
+        if chunks or now - self._failed_at > WELL_AFTER:
+            self.trouble.now(None)
+        return outcomes
 
     def _take_outcome(
         self, session: Session, chunk: Chunk, outcome: Outcome, answers: dict[int, Session], now: float
@@ -252,7 +264,7 @@ class Reception:
 
     def _hold(self, sessions: Iterable[Session], why: str, now: float) -> None:
         for session in sessions:
-            if not session.held:
+            if not session.held and self.sessions.get(session.connection) is session:
                 session.held, session.ask_at = True, now + HELD
                 self._send(session, Hold(why))
 

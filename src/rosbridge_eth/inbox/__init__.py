@@ -110,7 +110,7 @@ class Inbox(Protocol):
         """Take chunks, (Tk, chunk) each, all in one commit; one outcome for each, in order. Also InboxExchanged.
 
         A chunk is taken if its number is above the head of its stream, and neither the robot's share nor the whole
-        would be exceeded by it.
+        would be exceeded by it. Without chunks it tells whether the store is there, and the one it was.
         """
 
     def head(self, tk: bytes, stream: bytes) -> Head | None:

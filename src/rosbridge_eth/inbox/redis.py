@@ -116,7 +116,7 @@ class RedisInbox(Inbox):
     # What changes something
 
     def append(self, chunks: Sequence[tuple[bytes, Chunk]], now: float) -> list[Outcome]:
-        calls: dict[bytes, list[Any]] = {}
+        calls: dict[bytes, list[Any]] = {} if chunks else {b"": []}
         for tk, chunk in chunks:
             calls.setdefault(tk, [repr(now), self.max_bytes_per_robot, self.max_bytes]).extend(_row(chunk))
         answers = self._run([("append", tk, arguments) for tk, arguments in calls.items()])

@@ -462,6 +462,18 @@ def test_a_store_that_is_emptied_or_exchanged_is_told_once_before_anything_is_ta
     inbox.close()
 
 
+def test_an_exchanged_store_is_told_although_there_is_nothing_to_take(backend):
+    inbox = backend.open()
+    assert inbox.append([], 0.0) == []
+    put(inbox, chain(3))
+    backend.put_back(None)
+    with pytest.raises(InboxExchanged):
+        inbox.append([], 0.0)
+    assert inbox.append([], 0.0) == []
+    assert inbox.robots() == []
+    inbox.close()
+
+
 CHILD = """
 import random, sys
 from pathlib import Path
