@@ -10,7 +10,7 @@ not to waste gas on. What is in flight is kept in memory only; after a restart i
     in front and the inbox does not know all that was     chunk and what is behind it on the chain stand in front of
     ever written                                          the others; heads are raised, so that a robot which sends
                                                           them again is told they are known
-    the pool has fewer transactions than are in flight    the missing ones again, at the same price
+    the pool has fewer transactions than are in flight    the missing ones again, at today's price or the same
     the pool has more: a restart, somebody else           wait 30 s, then send over them
     nothing moved for 30 s                                all in flight again, an eighth dearer or at today's price
     the count is not what the transactions in blocks      forget what is in flight; then one batch at a time, tried
@@ -22,7 +22,7 @@ A batch counts as confirmed when a block N - 1 below the newest has it (N = 1: t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -36,7 +36,6 @@ from rosbridge_eth.ledger.contract import (
     NOTHING,
     WEI_PER_ETH,
     Block,
-    DataEvent,
     Fees,
     Ledger,
     Standing,
@@ -44,6 +43,7 @@ from rosbridge_eth.ledger.contract import (
     set_data_gas,
 )
 from rosbridge_eth.ledger.transport import AlreadyKnown, NonceTooLow, OutOfFunds, Reverted, Underpriced
+from rosbridge_eth.ledger.walk import Walk
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
@@ -85,39 +85,6 @@ class Batch(NamedTuple):
     @property
     def end(self) -> int:
         return self.first + len(self.rows)
-
-
-@dataclass(slots=True)
-class Walk:
-    """A reading of a robot's batches back from the last one. final: the block from which on all is confirmed."""
-
-    events: Iterator[DataEvent]
-    final: int
-    newest: list[bytes] = field(default_factory=list)  # chunks that are not confirmed and the one in front of them
-    reached: bool = False  # whether that one was read
-    on_chain: set[bytes] = field(default_factory=set)
-    heads: dict[bytes, Head] = field(default_factory=dict)
-    lowest: dict[bytes, int] = field(default_factory=dict)
-
-    def add(self, event: DataEvent) -> None:
-        for encoded in reversed(event.chunks):
-            if not self.reached:
-                self.newest.append(encoded)
-                self.reached = event.block <= self.final
-            try:
-                header = Chunk.parse(encoded).header
-            except Malformed:
-                continue  # another program's; no robot has it
-            self.on_chain.add(header.digest)
-            self.heads.setdefault(header.stream, Head(header.number, header.digest))
-            self.lowest[header.stream] = header.number
-
-    def settles(self, header: Header | None) -> bool:
-        """Whether it is known by now if this chunk is on the chain, where chunks stand in the order of the log."""
-        if header is None or not self.reached:
-            return self.reached
-        met = header.digest in self.on_chain or header.previous in self.on_chain
-        return met or self.lowest.get(header.stream, header.number) < header.number
 
 
 @dataclass(slots=True)
