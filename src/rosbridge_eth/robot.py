@@ -48,7 +48,6 @@ SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
 LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
-CLOSING_TIME = 1.0  # seconds for the server to learn that the robot leaves
 
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 _TIMEX_SIZE = 512  # struct timex has 208 bytes on 64-bit Linux; modes = 0 in its first word asks and changes nothing
@@ -256,11 +255,8 @@ class Robot:
 
     def _leave(self) -> None:
         """End the session in good order, so that the server need not wait for a silent robot."""
-        now = time.monotonic()
-        deadline = now + CLOSING_TIME
-        self.client.close(now)
-        while self.client.next_timer() is not None and time.monotonic() < deadline:
-            self.loop.step(0.05)
+        self.client.close(time.monotonic())
+        self.loop.step(0.0)
 
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender.statistics
