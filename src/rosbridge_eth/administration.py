@@ -444,6 +444,7 @@ def revoke(
         return Revoked(None)
     tk = robot_id(name)
     try:
+        ledger.check()
         [standing] = ledger.standings([tk])
         if standing.account is None or standing.revoked:
             if not in_force:

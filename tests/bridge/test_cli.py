@@ -7,51 +7,30 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.bundle import open_bundle
+from bridge.operations.conftest import Place, _made, place
 from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import OperatorHome, RobotHome
-from rosbridge_eth.ledger.accounts import Keyring
-from rosbridge_eth.ledger.embedded import EmbeddedChain
-from rosbridge_eth.robot.assembly import join
-from rosbridge_eth.server.administration import deploy_contract, init_home, load_ca, register_robot
+from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.sources import sample_bag
 
-PASSPHRASE, PASSWORD = b"operator's", b"robot's"
-NOW = datetime.now(UTC)
+__all__ = ["_made", "place"]  # fixtures
+
 Capture = pytest.CaptureFixture[str]
+BUNDLE = "operator/bundles/robot_1.bundle"
+ODOM = 'topics = ["/robot_1/odom"]\n'
+OPERATOR = ("--passphrase-file", "pass")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an operator's home, a deployed contract, a registered robot and its home."""
-    folder = tmp_path_factory.mktemp("made")
-    home, robot = OperatorHome(folder / "operator"), RobotHome(folder / "robot")
-    init_home(home, PASSPHRASE, listen="127.0.0.1:0", public=None, chain_url="http://127.0.0.1:9", server="server",
-              now=NOW)
-    keys = Keyring.load(home.accounts, PASSPHRASE)
-    chain = EmbeddedChain(fund={keys.operator.address: 10**21})
-    deploy_contract(home, chain, keys)
-    registered = register_robot(home, "robot_1", ca=load_ca(home, PASSPHRASE), keys=keys, chain=chain,
-                                password=PASSWORD, now=NOW)
-    join(robot, open_bundle(registered.bundle.read_bytes(), PASSWORD), PASSWORD)
-    return folder
-
-
-@pytest.fixture
-def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A fresh copy of it, with the passphrases in files; the current folder."""
-    subprocess.run(["cp", "-a", f"{made}/.", str(tmp_path)], check=True)
-    (tmp_path / "pass").write_bytes(PASSPHRASE)
-    (tmp_path / "word").write_bytes(PASSWORD)
-    (tmp_path / "wrong").write_bytes(b"not it")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+@pytest.fixture(autouse=True)
+def _files(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong passphrase, and an environment that speaks of no ROS."""
+    Path("wrong").write_bytes(b"not it")
+    for name in ("ROS_VERSION", "ROS_DISTRO", "ROS_MASTER_URI"):
+        monkeypatch.delenv(name, raising=False)
 
 
 def fails(capsys: Capture, code: ExitCode, says: str, *arguments: str) -> str:
@@ -68,132 +47,215 @@ def fails(capsys: Capture, code: ExitCode, says: str, *arguments: str) -> str:
     ('topics = "/a"\n', "it should be a list"),
     ("topics = [1]\n", "topics"),
     ('topics = ["/a"\n', "not TOML"),
-    ('topics = ["/robot_1/odom"]\nreaders = []\n', "no reader"),
-    ('topics = ["/robot_1/odom"]\nreaders = ["absent.pem"]\n', "does not exist"),
-    ('topics = ["/robot_1/odom"]\nname = "robot_2"\n', "robot_1"),
-    ('topics = ["/robot_1/odom"]\n[source]\nkind = "bag"\npath = "absent.bag"\n', "absent.bag"),
-    ('topics = [{topic = "/robot_1/odom", fields = ["pose.nose"]}]\n', "nose"),
-    ('topics = ["/robot_2/odom"]\n', "/robot_2/odom"),
+    (f'{ODOM}readers = []\n[source]\nkind = "sim"', "no reader"),
+    (f'{ODOM}readers = ["absent.pem"]\n[source]\nkind = "sim"', "does not exist"),
+    (f'{ODOM}name = "robot_2"\n', "name"),
+    (f'{ODOM}delivery = "latest"\n', "gone since the second edition"),
+    (ODOM, '[source] with kind = "ros1"'),
+    (f'{ODOM}[source]\nkind = "bag"\npath = "absent.bag"\n', "absent.bag"),
+    ('topics = [{topic = "/robot_1/odom", fields = ["pose.nose"]}]\n[source]\nkind = "sim"', "nose"),
+    ('topics = ["/robot_2/odom"]\n[source]\nkind = "sim"', "/robot_2/odom"),
 ])
-def test_a_robot_with_a_mistake_in_its_configuration_says_which(
-    place: Path, text: str, says: str, capsys: Capture
-) -> None:
+def test_a_robot_with_a_mistake_in_its_configuration_says_which(text: str, says: str, capsys: Capture) -> None:
     Path("robot/robot.toml").write_text(text)
     assert run(["robot", "--password-file", "word"]) in (ExitCode.CONFIG, ExitCode.SOURCE)
     error = capsys.readouterr().err
     assert says in error and "Traceback" not in error
 
 
-def test_a_missing_home_names_the_command_that_makes_it(place: Path, capsys: Capture) -> None:
+def test_a_missing_home_names_the_command_that_makes_it(capsys: Capture) -> None:
     fails(capsys, ExitCode.CONFIG, "join", "robot", "--home", "nowhere", "--password-file", "word")
     fails(capsys, ExitCode.CONFIG, "init", "status", "--home", "nowhere")
+    fails(capsys, ExitCode.CONFIG, "init", "server", "--home", "nowhere", *OPERATOR)
+    fails(capsys, ExitCode.CONFIG, "reader NAME", "read", "robot_1", "--home", "nowhere", *OPERATOR)
 
 
-def test_an_existing_home_is_not_made_again(place: Path, capsys: Capture) -> None:
+def test_an_existing_home_is_not_made_again(capsys: Capture) -> None:
     before = Path("operator/accounts.json").read_bytes()
-    fails(capsys, ExitCode.CONFIG, "not empty", "init", "--passphrase-file", "pass")
-    assert Path("operator/accounts.json").read_bytes() == before
-    bundle = "operator/bundles/robot_1.bundle"
-    fails(capsys, ExitCode.CONFIG, "already", "join", bundle, "--password-file", "word")
+    fails(capsys, ExitCode.CONFIG, "home already", "init", *OPERATOR, "--reader-passphrase-file", "readers")
+    fails(capsys, ExitCode.CONFIG, "home already", "init", "--home", "new", *OPERATOR, "--reader-passphrase-file",
+          "readers")  # the reader's would be
+    assert Path("operator/accounts.json").read_bytes() == before and not Path("new").exists()
+    fails(capsys, ExitCode.CONFIG, "already", "join", "--name", "robot_1", "--password-file", "word")
 
 
-def test_a_wrong_passphrase_is_told(place: Path, capsys: Capture) -> None:
-    fails(capsys, ExitCode.IDENTITY, "password", "robot", "--password-file", "wrong")
-    fails(capsys, ExitCode.IDENTITY, "", "server", "--passphrase-file", "wrong")
-    bundle = "operator/bundles/robot_1.bundle"
-    fails(capsys, ExitCode.IDENTITY, "password", "join", bundle, "--home", "other", "--password-file", "wrong")
-    assert not Path("other").exists()
+def test_a_home_of_another_kind_is_told(capsys: Capture) -> None:
+    fails(capsys, ExitCode.CONFIG, "operator is an operator's home", "robot", "--home", "operator",
+          "--password-file", "word")
+    fails(capsys, ExitCode.CONFIG, "robot is a robot's home", "server", "--home", "robot", *OPERATOR)
+    fails(capsys, ExitCode.CONFIG, "robot is a robot's home", "read", "robot_1", "--home", "robot", *OPERATOR)
 
 
-def test_a_key_that_others_can_read_is_refused_with_the_mend(place: Path, capsys: Capture) -> None:
+def test_a_wrong_passphrase_is_told(capsys: Capture) -> None:
+    fails(capsys, ExitCode.IDENTITY, "wrong password", "server", "--passphrase-file", "wrong")
+    fails(capsys, ExitCode.IDENTITY, "", "mnemonic", "--passphrase-file", "wrong")
+    fails(capsys, ExitCode.IDENTITY, "", "read", "robot_1", "--passphrase-file", "wrong")
+    Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "sim"\n')
+    fails(capsys, ExitCode.IDENTITY, "pass", "robot", "--password-file", "wrong")
+    fails(capsys, ExitCode.IDENTITY, "does not open", "passwd", "--passphrase-file", "wrong",
+          "--new-passphrase-file", "word")
+
+
+def test_a_key_that_others_can_read_is_refused_with_the_mend(capsys: Capture) -> None:
+    Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "sim"\n')
     Path("robot/identity/sign.key.pem").chmod(0o644)
     fails(capsys, ExitCode.IDENTITY, "chmod 600", "robot", "--password-file", "word")
 
 
-def test_a_node_that_does_not_answer_is_told(place: Path, capsys: Capture) -> None:
+def test_a_node_that_does_not_answer_is_told(capsys: Capture) -> None:
     Path("operator/deployment.json").rename("deployment.kept")
-    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "deploy", "--passphrase-file", "pass")
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "deploy", *OPERATOR)
+    fails(capsys, ExitCode.CHAIN, "deploy", "server", *OPERATOR)
     Path("deployment.kept").rename("operator/deployment.json")
-    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "server", "--passphrase-file", "pass")
-    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "read", "robot_1", "--passphrase-file", "pass")
-
-
-def test_status_works_without_the_node_and_says_so(place: Path, capsys: Capture) -> None:
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "server", *OPERATOR)
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "check", "robot_1", "0f" * 16, "0")
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "read", "robot_1", "--passphrase-file", "readers")
+    fails(capsys, ExitCode.CHAIN, "half done", "revoke", "robot_1", "--compromised", *OPERATOR)
     assert run(["status", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert [name["name"] for name in report["names"]] == ["server", "owner", "robot_1"]
-    assert "127.0.0.1:9" in report["node"]
+    assert json.loads(capsys.readouterr().out)["robots"]["robot_1"]["in_force"] is False, "the server knows it"
 
 
-def test_a_second_contract_is_not_deployed_by_accident(place: Path, capsys: Capture) -> None:
-    fails(capsys, ExitCode.CONFIG, "deployed already", "deploy", "--passphrase-file", "pass")
+def test_a_second_contract_is_not_deployed_by_accident(capsys: Capture) -> None:
+    fails(capsys, ExitCode.CONFIG, "deployed already", "deploy", *OPERATOR)
 
 
-def test_a_used_name_is_not_taken(place: Path, capsys: Capture) -> None:
-    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "register", "robot_2", "--passphrase-file", "pass",
-          "--password-file", "word")
+def test_a_robot_that_cannot_be_registered_leaves_nothing(capsys: Capture) -> None:
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "register", "robot_2", *OPERATOR, "--password-file", "word")
     assert not Path("operator/bundles/robot_2.bundle").exists()
+    fails(capsys, ExitCode.CONFIG, "absent", "register", "robot_2", "absent", *OPERATOR)
+    fails(capsys, ExitCode.IDENTITY, "no request file", "register", "robot_2", "word", *OPERATOR)
 
 
-@pytest.mark.parametrize("name", ["", "Robot", "../x", "a" * 64])
-def test_a_name_that_is_none_is_refused(place: Path, name: str, capsys: Capture) -> None:
-    assert run(["revoke", name, "--passphrase-file", "pass"]) in (ExitCode.IDENTITY, ExitCode.CHAIN)
+@pytest.mark.parametrize("name", ["", "Robot", "../x", "a" * 64, "-x", "é"])
+def test_a_name_that_is_none_is_refused(name: str, capsys: Capture) -> None:
+    assert run(["join", "--home", "other", "--password-file", "word", f"--name={name}"]) == ExitCode.IDENTITY
+    assert not Path("other").exists()
+    assert run(["reader", "--to", "other", *OPERATOR, "--reader-passphrase-file", "word", "--", name]) == (
+        ExitCode.IDENTITY
+    )
+    assert not Path("other").exists()
+    assert run(["revoke", *OPERATOR, "--", name]) in (ExitCode.IDENTITY, ExitCode.CHAIN)
     assert "Traceback" not in capsys.readouterr().err
 
 
-def test_a_corrupt_spool_is_kept_aside_and_told(place: Path, capsys: Capture) -> None:
+def test_a_corrupt_spool_is_kept_aside_and_told(capsys: Capture) -> None:
+    Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "sim"\n')
     Path("robot/spool.sqlite").write_bytes(b"no database " * 400)
-    fails(capsys, ExitCode.STORE, "spool", "robot", "--password-file", "word")
+    fails(capsys, ExitCode.STORE, "spool.sqlite.damaged-1", "robot", "--password-file", "word")
 
 
-def test_a_corrupt_bag_is_told(place: Path, capsys: Capture) -> None:
+def test_a_corrupt_bag_is_told(place: Place, capsys: Capture) -> None:
     whole = sample_bag().read_bytes()
     Path("cut.bag").write_bytes(whole[: len(whole) // 2])
-    Path("robot/robot.toml").write_text(
-        f'topics = ["/robot_1/odom"]\n[source]\nkind = "bag"\npath = "{place}/cut.bag"\n'
-    )
+    Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "bag"\npath = "{place.path}/cut.bag"\n')
     fails(capsys, ExitCode.SOURCE, "cut.bag", "robot", "--password-file", "word")
 
 
-def test_a_bundle_that_is_none_is_told(place: Path, capsys: Capture) -> None:
-    fails(capsys, ExitCode.IDENTITY, "not a bundle", "join", "word", "--home", "other", "--password-file", "word")
+def test_a_bundle_that_is_none_is_told(capsys: Capture) -> None:
+    fails(capsys, ExitCode.IDENTITY, "no bundle file", "join", "word", "--home", "other", "--password-file", "word")
     fails(capsys, ExitCode.CONFIG, "absent", "join", "absent", "--home", "other", "--password-file", "word")
+    fails(capsys, ExitCode.CONFIG, "request", "join", BUNDLE, "--home", "other")
+    assert not Path("other").exists()
+    assert run(["join"]) == run(["join", BUNDLE, "--name", "robot_1"]) == ExitCode.USAGE
 
 
-def test_times_without_a_zone_are_refused(place: Path, capsys: Capture) -> None:
-    fails(capsys, ExitCode.CONFIG, "time", "read", "robot_1", "--from", "yesterday", "--passphrase-file", "pass")
+@pytest.mark.parametrize("option", ["--from", "--to", "--at"])
+@pytest.mark.parametrize("time", ["yesterday", "2026-11-21T10:00:00", "10^400", ""])
+def test_times_that_are_none_or_have_no_zone_are_refused(option: str, time: str, capsys: Capture) -> None:
+    fails(capsys, ExitCode.USAGE, "time", "read", "robot_1", option, time, "--passphrase-file", "readers")
 
 
-def test_usage_errors_end_with_2(place: Path) -> None:
+def test_usage_errors_end_with_2(capsys: Capture) -> None:
     assert run(["no-such-command"]) == ExitCode.USAGE
     assert run(["server", "--workers", "0"]) == ExitCode.USAGE
+    assert run(["read"]) == ExitCode.USAGE
+    assert run(["read", "robot_1", "--at", "2026-11-21T10:00:00Z", "--to", "2026-11-22T10:00:00Z"]) == ExitCode.USAGE
+    assert run(["read", "robot_1", "--from", "2026-11-22T10:00:00Z", "--to", "2026-11-21T10:00:00Z"]) == ExitCode.USAGE
+    assert run(["check", "robot_1", "0f" * 16, "-1"]) == ExitCode.USAGE
+
+
+def test_version_and_help_are_there_in_short_and_long(capsys: Capture) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("rosbridge-eth 0.")
+    for help_option in ("-h", "--help"):
+        for command in ([], ["read"], ["doctor"], ["status"]):
+            assert run([*command, help_option]) == 0
+            assert "Usage" in capsys.readouterr().out
 
 
 @pytest.mark.service
-def test_a_port_in_use_and_another_chain_are_told(place: Path, require: Callable[[str], str], capsys: Capture) -> None:
+def test_a_port_in_use_and_another_chain_are_told(place: Place, require: Callable[[str], str], capsys: Capture) -> None:
     require("npx")
-    from rosbridge_eth.ledger.anvil import start
-
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    config = Path("operator/server.toml")
-    config.write_text(config.read_text().replace("127.0.0.1:9", f"127.0.0.1:{port}"))
-    with start(port):
-        fails(capsys, ExitCode.CHAIN, "chain", "server", "--passphrase-file", "pass")
-        Path("operator/deployment.json").unlink()
-        from rosbridge_eth import ledger
-
-        node = ledger.connect(f"http://127.0.0.1:{port}")
-        node.request("anvil_setBalance", Keyring.load(Path("operator/accounts.json"), PASSPHRASE).operator.address,
-                     hex(10**20))
-        node.close()
-        assert run(["deploy", "--passphrase-file", "pass"]) == 0
+    text = place.operator.config.read_text()
+    place.operator.config.write_text(text[: text.index("[chain]")] + f'[chain]\nurl = "http://127.0.0.1:{port}"\n')
+    with Anvil.start(port) as anvil:
+        fails(capsys, ExitCode.CHAIN, "another chain", "server", *OPERATOR)
+        place.operator.deployment_file.unlink()
+        error = fails(capsys, ExitCode.CHAIN, place.operator.account, "deploy", *OPERATOR)
+        assert "ETH" in error, "who is to be paid, and how much"
+        anvil.fund(place.operator.account, 100)
+        assert run(["deploy", *OPERATOR]) == 0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
             taken.bind(("127.0.0.1", 0))
-            text = config.read_text().replace("127.0.0.1:0", f"127.0.0.1:{taken.getsockname()[1]}")
-            config.write_text(text)
-            fails(capsys, ExitCode.NETWORK, "port", "server", "--passphrase-file", "pass")
+            place.configure("127.0.0.1:0", f"127.0.0.1:{taken.getsockname()[1]}")
+            fails(capsys, ExitCode.NETWORK, "port", "server", *OPERATOR)
+
+
+def test_the_passphrase_may_be_named_by_the_configuration_or_the_environment(
+    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    fails(capsys, ExitCode.IDENTITY, "--passphrase-file", "mnemonic")
+    monkeypatch.setenv("ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE", str(place.path / "pass"))
+    assert run(["mnemonic"]) == 0
+    words = capsys.readouterr().out
+    assert len(words.split()) == 24
+    monkeypatch.delenv("ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE")
+    place.configure('name = "server"', f'name = "server"\npassphrase_file = "{place.path / "pass"}"')
+    assert run(["mnemonic"]) == 0
+    assert capsys.readouterr().out == words
+
+
+def test_accounts_are_restored_from_the_words_that_mnemonic_shows(place: Place, capsys: Capture) -> None:
+    assert run(["mnemonic", *OPERATOR]) == 0
+    Path("words").write_text(capsys.readouterr().out)
+    arguments = ["init", "--home", "again", "--reader", "again-reader", "--mnemonic-file", "words", *OPERATOR,
+                 "--reader-passphrase-file", "readers", "--public", "192.0.2.1:7410"]  # fmt: skip
+    assert run(arguments) == 0
+    said = capsys.readouterr().err
+    assert f"The operator's account is {place.operator.account}" in said and "192.0.2.1:7410" in said
+    Path("words").write_text("one two three\n")
+    fails(capsys, ExitCode.IDENTITY, "mnemonic", *(word.replace("again", "third") for word in arguments))
+
+
+def test_a_home_is_copied_and_its_passphrase_changed(place: Place, capsys: Capture) -> None:
+    assert run(["backup", "copy"]) == 0
+    fails(capsys, ExitCode.CONFIG, "copy is an operator's home already", "backup", "copy")
+    Path("new").write_bytes(b"a new one")
+    assert run(["passwd", *OPERATOR, "--new-passphrase-file", "new"]) == 0
+    fails(capsys, ExitCode.IDENTITY, "", "mnemonic", *OPERATOR)
+    assert run(["mnemonic", "--passphrase-file", "new"]) == 0
+    assert run(["mnemonic", "--home", "copy", *OPERATOR]) == 0
+    for home, secret in (("robot", "word"), ("reader", "readers")):
+        assert run(["passwd", "--home", home, "--passphrase-file", secret, "--new-passphrase-file", "new"]) == 0
+
+
+def test_an_account_is_exported_for_other_software(place: Place, capsys: Capture) -> None:
+    from eth_account import Account
+
+    for name in ("operator", "robot_1"):
+        assert run(["export", name, f"{name}.json", *OPERATOR, "--password-file", "word"]) == 0
+        exported = json.loads(Path(f"{name}.json").read_bytes())
+        address = Account.from_key(Account.decrypt(exported, Path("word").read_text())).address
+        assert (address == place.operator.account) == (name == "operator")
+        assert address in capsys.readouterr().err
+        assert Path(f"{name}.json").stat().st_mode & 0o077 == 0
+    ours = (*OPERATOR, "--password-file", "word")
+    fails(capsys, ExitCode.CONFIG, "exists", "export", "operator", "operator.json", *ours)
+    fails(capsys, ExitCode.IDENTITY, "`status` lists", "export", "robot_9", "x.json", *ours)
+    assert not Path("x.json").exists()
 
 
 def test_without_the_bridge_packages_the_command_says_how_to_get_them() -> None:

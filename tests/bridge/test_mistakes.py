@@ -2,122 +2,154 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sqlite3
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from rosbridge_eth.robot.assembly import open_robot
 
 import rosbridge_eth
-from bridge.test_cli import Capture, fails, made, place
+from bridge.disks import fill_up, small_disk
+from bridge.operations.conftest import PASSWORD, READERS, Place
+from bridge.test_cli import BUNDLE, ODOM, OPERATOR, Capture, _files, _made, fails, place
+from rosbridge_eth import terminal
 from rosbridge_eth.capture import RawMessage
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import RobotHome
-from rosbridge_eth.ledger.accounts import Keyring
+from rosbridge_eth.identity import load_identity, read_certificates
 from rosbridge_eth.registry import Registry
+from rosbridge_eth.robot import open_robot, reader_keys
 
-__all__ = ["made", "place"]  # fixtures
+__all__ = ["_files", "_made", "place"]  # fixtures
 
-BUNDLE = "operator/bundles/robot_1.bundle"
-DAY_ONE = 42.0  # seconds after the first of January 1970: a clock without a battery
+SOURCE = str(Path(rosbridge_eth.__file__).parents[1])
 
 
-def test_a_file_in_the_way_of_a_folder_is_one_line(place: Path, capsys: Capture) -> None:
+def test_a_file_in_the_way_of_a_folder_is_one_line(capsys: Capture) -> None:
     Path("taken").write_text("not a folder")
-    error = fails(capsys, ExitCode.FAILED, "taken", "join", BUNDLE, "--home", "taken/robot", "--password-file", "word")
+    error = fails(capsys, ExitCode.FAILED, "taken", "join", "--name", "x", "--home", "taken/robot",
+                  "--password-file", "word")  # fmt: skip
     assert len(error.splitlines()) == 1
-    fails(capsys, ExitCode.FAILED, "taken", "init", "--home", "taken/operator", "--passphrase-file", "pass")
+    fails(capsys, ExitCode.FAILED, "taken", "init", "--home", "taken/operator", "--reader", "r", *OPERATOR,
+          "--reader-passphrase-file", "readers")
 
 
-def test_a_database_that_fails_while_it_is_used_is_one_line(place: Path, capsys: Capture) -> None:
+def test_a_database_that_fails_while_it_is_used_is_one_line(capsys: Capture) -> None:
     holder = sqlite3.connect("operator/registry.sqlite", isolation_level=None)
-    holder.execute("ALTER TABLE enrolment RENAME COLUMN role TO part")  # opens, and fails at the first question
+    holder.execute("ALTER TABLE enrolment RENAME COLUMN account TO part")  # opens, and fails at the first write
+    holder.execute("ALTER TABLE enrolment RENAME COLUMN revoked_at TO gone")
     holder.close()
-    error = fails(capsys, ExitCode.STORE, "database", "status")
+    error = fails(capsys, ExitCode.STORE, "database", "renew", *OPERATOR)
     assert len(error.splitlines()) == 1
 
 
-def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    home = RobotHome(Path("robot"))
-    Path("robot/robot.toml").write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
-    robot = open_robot(home, load_robot_config(home.config), b"robot's")
+def test_a_full_disk_at_the_operators_is_one_line(place: Place, tmp_path: Path, capsys: Capture) -> None:
+    with small_disk(tmp_path / "disk", "1m") as disk:
+        fill_up(disk)
+        error = fails(capsys, ExitCode.FAILED, "No space left", "join", "--name", "x", "--home", str(disk / "robot"),
+                      "--password-file", "word")  # fmt: skip
+        assert len(error.splitlines()) == 1
+
+
+def test_a_reader_of_the_output_that_has_enough_is_no_mistake(place: Place) -> None:
+    process = subprocess.Popen([sys.executable, "-m", "rosbridge_eth", "status", "--json"], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": SOURCE})  # fmt: skip
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert b"Traceback" not in process.stderr.read()
+    assert process.wait(60) == ExitCode.FAILED
+
+
+def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    place.robot.config.write_text(f'{ODOM}[source]\nkind = "sim"\n')
+    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
 
     def breaks(emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
         raise MemoryError("no room for this message")
 
-    monkeypatch.setattr(robot._source, "run", breaks)
+    monkeypatch.setattr(robot.source, "run", breaks)
     with pytest.raises(MemoryError):
-        robot.run()
+        robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() else None)
 
 
-def test_usage_is_still_told_by_its_own_code(place: Path) -> None:
-    assert run(["read"]) == ExitCode.USAGE
+@pytest.mark.parametrize("home, whose", [("operator", "an operator's"), ("reader", "a reader's")])
+def test_a_robot_does_not_move_into_a_home_of_another_kind(home: str, whose: str, capsys: Capture) -> None:
+    before = {path: path.read_bytes() for path in Path(home).rglob("*") if path.is_file()}
+    fails(capsys, ExitCode.CONFIG, f"{home} is {whose} home", "join", BUNDLE, "--home", home)
+    fails(capsys, ExitCode.CONFIG, f"{home} is {whose} home", "join", "--name", "x", "--home", home,
+          "--password-file", "word")
+    assert {path: path.read_bytes() for path in Path(home).rglob("*") if path.is_file()} == before
 
 
 def test_ctrl_c_while_the_packages_load_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
-    source = str(Path(rosbridge_eth.__file__).parents[1])
     process = subprocess.run(
         [sys.executable, "-m", "rosbridge_eth", "status"], capture_output=True, text=True, timeout=60, check=False,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), source])},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), SOURCE])},
     )
     assert (process.returncode, process.stderr) == (130, "rosbridge-eth: interrupted\n")
 
 
 @pytest.mark.parametrize("emptied", [False, True])
 @pytest.mark.parametrize("command", [
-    ("status",), ("register", "robot_2", "--password-file", "word"), ("revoke", "robot_1"),
-    ("reader", "analyst", "--password-file", "word"), ("renew",), ("export", "robot_1", "keystore.json"),
+    ("status",), ("renew",), ("export", "robot_1", "keystore.json", "--password-file", "word"),
+    ("reader", "analyst", "--reader-passphrase-file", "word"),
 ])
 def test_a_lost_registry_is_told_and_nothing_is_built_upon_an_empty_one(
-    place: Path, command: tuple[str, ...], emptied: bool, capsys: Capture
+    command: tuple[str, ...], emptied: bool, capsys: Capture
 ) -> None:
     registry = Path("operator/registry.sqlite")
     for part in Path("operator").glob("registry.sqlite*"):
         part.unlink()
     if emptied:
         registry.touch()
-    before = sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry"))
-    more = () if command == ("status",) else ("--passphrase-file", "pass")
+    before = sorted(path for path in Path().rglob("*") if not path.name.startswith("registry"))
+    more = () if command == ("status",) else OPERATOR
     error = fails(capsys, ExitCode.STORE, "restore registry.sqlite from your backup", *command, *more)
     assert len(error.splitlines()) == 1
     assert registry.exists() == emptied
-    assert sorted(path for path in Path("operator").rglob("*") if not path.name.startswith("registry")) == before
+    assert sorted(path for path in Path().rglob("*") if not path.name.startswith("registry")) == before
 
 
-def test_export_never_takes_the_treasury_for_a_robot(place: Path, capsys: Capture) -> None:
-    ours = ("--passphrase-file", "pass", "--password-file", "word")
-    registry = Registry(Path("operator/registry.sqlite"))
-    registry.enrol(number=registry.next_number(), role="robot", name="operator", fingerprint=b"f" * 32,
-                   certificates=b"", account="0x1", now=datetime.now(UTC))  # before the name was reserved
-    fails(capsys, ExitCode.IDENTITY, "--role", "export", "operator", "a.json", *ours)
-    assert not Path("a.json").exists()
-    assert run(["export", "operator", "a.json", "--role", "operator", *ours]) == 0
-    assert run(["export", "operator", "b.json", "--role", "robot", *ours]) == 0
-    registry.revoke("robot", "operator", datetime.now(UTC))
-    assert run(["export", "operator", "c.json", *ours]) == 0
-    keys = Keyring.load(Path("operator/accounts.json"), b"operator's")
-    addresses = [json.loads(Path(file).read_text())["address"][-40:].lower() for file in ("a.json", "b.json", "c.json")]
-    treasury = keys.operator.address.lower().removeprefix("0x")
-    assert [address == treasury for address in addresses] == [True, False, True]
-    fails(capsys, ExitCode.IDENTITY, "reader 'owner'", "export", "owner", "d.json", "--role", "reader", *ours)
+def test_another_reader_is_made_carried_and_given_to_a_robot(place: Place, capsys: Capture) -> None:
+    ours = (*OPERATOR, "--reader-passphrase-file", "word")
+    assert run(["reader", "analyst", *ours]) == 0
+    assert "public.pem" in capsys.readouterr().err
+    fails(capsys, ExitCode.CONFIG, "home already", "reader", "analyst", *ours)
+    fails(capsys, ExitCode.IDENTITY, "--replace", "reader", "analyst", "--to", "elsewhere", *ours)
+    assert run(["reader", "analyst", "--to", "elsewhere", "--replace", *ours]) == 0
+    carried = Path("elsewhere").rename("carried")
+    content = b"".join(path.read_bytes() for path in carried.iterdir())
+    assert not any(secret in content for secret in (b"node-key", b"path-key", b"query-key", READERS))
+    # As far as the node, which is not there: everything before it was found in the folder.
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "read", "robot_1", "--home", "carried", "--passphrase-file", "word")
+    config = load_robot_config(place.robot.config)
+    roots = read_certificates((place.robot.identity / "ca.crt.pem").read_bytes())
+    before = reader_keys(config, place.robot, roots)
+    (place.robot.readers / "analyst.pem").write_bytes((carried / "public.pem").read_bytes())
+    identity, _ = load_identity(carried, PASSWORD)
+    after = {key.to_bytes() for key in reader_keys(config, place.robot, roots)}
+    assert after == {key.to_bytes() for key in before} | {identity.encryption_key.public_key.to_bytes()}
+    assert run(["revoke", "analyst", "--role", "reader", *OPERATOR]) == 0, "that takes no node"
+    with Registry(place.operator.registry) as registry:
+        assert [reader.name for reader in registry.readers()] == ["owner"]
 
 
-def test_a_record_is_asked_for_by_a_name_that_is_enrolled_and_a_stream_that_is_one(
-    place: Path, capsys: Capture
-) -> None:
-    stream = "0f" * 16
-    fails(capsys, ExitCode.IDENTITY, "no robot 'robot_9' is enrolled; `status` lists", "check", "robot_9", stream, "1")
-    for wrong in ("zz", "0f" * 15, "0f" * 17, "0f " * 16):
-        fails(capsys, ExitCode.CONFIG, "the stream is 32 hex digits", "check", "robot_1", wrong, "1")
-    assert run(["check", "robot_1", stream, "1"]) == 0
-    assert capsys.readouterr().out.strip() == "unknown"
+def test_what_is_said_is_never_markup(capsys: Capture) -> None:
+    terminal.talk("[red]what a stranger[/red] says [/]")
+    assert capsys.readouterr().err == "[red]what a stranger[/red] says [/]\n"
+    terminal.data.print(terminal.table("T", ["a"], [["[red]x[/red] [/]"]]))
+    assert "[red]x[/red] [/]" in capsys.readouterr().out
+
+
+def test_json_goes_to_stdout_and_words_to_stderr(place: Place) -> None:
+    environment = {**os.environ, "PYTHONPATH": SOURCE}
+    done = subprocess.run([sys.executable, "-m", "rosbridge_eth", "doctor", "--json"], capture_output=True, text=True,
+                          env=environment, check=False)  # fmt: skip
+    assert done.stdout.startswith("{") and done.stdout.count("\n") == 1
+    assert done.returncode == ExitCode.FAILED and "things are broken" in done.stderr
