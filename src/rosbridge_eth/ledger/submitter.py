@@ -441,11 +441,18 @@ class Submitter:
     # ------------------------------------------------------------------ money
 
     def _top_up(self, work: Sequence[Work], nonces: tuple[int, int], now: float) -> None:
-        """allocETH for accounts that have work and little money; nothing while the operator's last are in no block."""
+        """allocETH for accounts that have work and less than low water, or than what is in flight may cost; nothing
+        while the operator's last transactions are in no block.
+        """
         funds, (latest, pending) = self._funds, nonces
         if funds.nonce != latest:
             funds.nonce, funds.since = latest, now
-        poor = [w.standing for w in work if w.standing.balance < self._needs(self._known[w.tk])]
+        poor = []
+        for w in work:
+            account = self._known[w.tk]
+            cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
+            if w.standing.balance < min(max(self._settings.low_water, cost), BALANCE_LIMIT // 2):
+                poor.append(w.standing)
         if self._operator is None or not poor or (pending > latest and not funds.due(now)):
             return
         stuck = pending > latest
@@ -468,11 +475,6 @@ class Submitter:
         for error in self._ledger.send(raws):
             if error is not None and not isinstance(error, AlreadyKnown):
                 self.funds = str(error)
-
-    def _needs(self, account: Account) -> int:
-        """Below which balance an account is topped up: low water, or what is in flight at the highest price."""
-        cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
-        return min(max(self._settings.low_water, cost), BALANCE_LIMIT // 2)
 
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:

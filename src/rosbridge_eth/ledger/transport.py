@@ -35,8 +35,7 @@ from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 from rosbridge_eth.errors import ChainError
 
 MAX_ANSWER = 64 * 2**20  # bytes; the events of a full block are a tenth of it
-BATCH = 50  # requests in one HTTP request
-BATCH_BYTES = 900_000  # of one; nginx takes 1 MB where nobody said otherwise, anvil 2, geth 5
+AT_ONCE = 50  # requests in one HTTP request
 _PIECE = 64 * 1024
 
 
@@ -234,10 +233,11 @@ class Node:
         if self._session is not None:
             self._session.close()
 
-    def many(self, requests: Sequence[tuple[str, list[Any]]]) -> list[Any]:
+    def many(self, requests: Sequence[tuple[str, list[Any]]], at_once: int = AT_ONCE) -> list[Any]:
         """The answers to many requests in few HTTP requests; a ChainError in the place of one that was refused."""
         answers: list[Any] = []
-        for page in _pages(requests):
+        for start in range(0, len(requests), at_once):
+            page: Any = list(requests[start : start + at_once])
             with self.asking():
                 got: Any = self.w3.provider.make_batch_request(page)  # type: ignore[attr-defined]
                 if not isinstance(got, list) or len(got) != len(page):
@@ -290,20 +290,6 @@ class Node:
         except (DecodingError, ValueError):
             pass
         return None
-
-
-def _pages(requests: Sequence[tuple[str, list[Any]]]) -> Iterator[list[tuple[Any, list[Any]]]]:
-    page: list[tuple[str, list[Any]]] = []
-    size = 0
-    for request in requests:
-        weight = len(str(request[1][0]))
-        if page and (len(page) == BATCH or size + weight > BATCH_BYTES):
-            yield page
-            page, size = [], 0
-        page.append(request)
-        size += weight
-    if page:
-        yield page
 
 
 def _reason(error: requests.RequestException) -> str:

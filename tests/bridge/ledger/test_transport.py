@@ -243,7 +243,8 @@ def test_many_requests_go_in_batches_that_nodes_and_their_proxies_take():
 
     with HostileNode(count) as node:
         assert ledger(node).send([bytes(98_000)] * 20 + [b"x"] * 120) == [None] * 140
-    assert all(requests <= 50 and size < 10**6 for requests, size in sizes)
+    assert len(sizes) == 35
+    assert all(size < 10**6 for _, size in sizes)
 
 
 @pytest.mark.parametrize(
