@@ -3,12 +3,16 @@
 `SM4GCM` is what new designs want: it hides and protects. `encrypt`, `decrypt`
 and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
 already exist. `SM4` is the bare block.
+
+`ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC): "cryptography"
+where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from smcrypto.sm4 import serial
 from smcrypto.sm4.cipher import SM4
 from smcrypto.sm4.modes import (
     CBC,
@@ -27,11 +31,14 @@ from smcrypto.sm4.modes import (
 if TYPE_CHECKING:
     from smcrypto.sm4.aead import SM4CCM, SM4GCM
 
+    ENGINE: str
+
 __all__ = [
     "CBC",
     "CFB",
     "CTR",
     "ECB",
+    "ENGINE",
     "OFB",
     "SM4",
     "SM4CCM",
@@ -45,8 +52,10 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> type:
-    """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD."""
+def __getattr__(name: str) -> type | str:
+    """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD. ENGINE may change."""
+    if name == "ENGINE":
+        return serial.ENGINE
     if name in ("SM4CCM", "SM4GCM"):
         from smcrypto.sm4 import aead
 

@@ -106,18 +106,66 @@ class _Transform(Protocol):
     def finalize(self) -> bytes: ...
 
 
-class _Blocks:
-    """Streams of whole blocks: keeps an incomplete block back, refuses one at the end."""
+# What a mode does to blocks: (engine, chain, data, whole) -> (image of the data, the chain after its first `whole`
+# bytes). The chain is a block: the IV or the counter at first. Data is whole blocks; of the last, a part may be zeros
+# that stand for what has not come yet, and then `whole` ends before it.
+_Step: TypeAlias = Callable[[Engine, bytes, bytes, int], tuple[bytes, bytes]]
 
-    def __init__(self, process: Callable[[bytes], bytes]) -> None:
-        self._process = process
+
+def _ecb_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    return engine.encrypt(data), chain
+
+
+def _ecb_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    return engine.decrypt(data), chain
+
+
+def _cbc_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    out = engine.cbc_encrypt(chain, data)
+    return out, (chain + out[-16:])[-16:]
+
+
+def _cbc_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    before = chain + data
+    return engine.decrypt(data, before[: len(data)]), before[-16:]
+
+
+def _cfb_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    """C_i = P_i ^ D_i with D_i = E(C_(i-1)) = E(P_(i-1) ^ D_(i-1)): D is CBC of C_0, P_1, P_2, ... from zero on."""
+    before = chain + data
+    out = xor_bytes(engine.cbc_encrypt(bytes(16), before[: len(data)]), data)
+    return out, out[whole - 16 : whole] if whole else chain
+
+
+def _cfb_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    before = chain + data
+    return engine.encrypt(before[: len(data)], data), before[whole : whole + 16]
+
+
+def _ofb(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    """O_i = E(O_(i-1)): CBC of zeros."""
+    stream = engine.cbc_encrypt(chain, bytes(len(data)))
+    return xor_bytes(data, stream), stream[whole - 16 : whole] if whole else chain
+
+
+def _ctr(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    counter = (int.from_bytes(chain, "big") + whole // 16) % (1 << 128)
+    return engine.ctr_xor(chain, data), counter.to_bytes(16, "big")
+
+
+class _WholeBlocks:
+    """ECB and CBC: keeps an incomplete block back, refuses one at the end."""
+
+    def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
+        self._engine, self._step, self._chain = engine, step, chain
         self._pending = b""
 
     def update(self, data: bytes) -> bytes:
         data = self._pending + data
         whole = len(data) & ~15
         self._pending = data[whole:]
-        return self._process(data[:whole])
+        out, self._chain = self._step(self._engine, self._chain, data[:whole], whole)
+        return out
 
     def finalize(self) -> bytes:
         if self._pending:
@@ -125,102 +173,24 @@ class _Blocks:
         return b""
 
 
-class _CBCEncrypt:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
+class _AnyLength:
+    """CFB, OFB and CTR: out = in XOR mask. A block that was begun is done again, whole, once the rest has come."""
 
-    def __call__(self, blocks: bytes) -> bytes:
-        out = self._engine.cbc_encrypt(self._chain, blocks)
-        self._chain = (self._chain + out)[-16:]
-        return out
-
-
-class _CBCDecrypt:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
-
-    def __call__(self, blocks: bytes) -> bytes:
-        chained = self._chain + blocks
-        self._chain = chained[-16:]
-        return self._engine.decrypt(blocks, chained[: len(blocks)])
-
-
-class _KeyStream:
-    """CTR and OFB: XOR with a stream that does not depend on the data; what is left of a block is kept."""
-
-    def __init__(self, stream: Callable[[bytes], bytes]) -> None:
-        self._xor_stream = stream
-        self._left = b""
+    def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
+        self._engine, self._step, self._chain = engine, step, chain
+        self._begun = self._mask = b""  # what came of the block, and the mask for what has not
 
     def update(self, data: bytes) -> bytes:
-        head, data = data[: len(self._left)], data[len(self._left) :]
-        out = xor_bytes(head, self._left[: len(head)])
-        self._left = self._left[len(head) :]
-        if not data:
-            return out
-        masked = self._xor_stream(data + bytes(-len(data) % 16))
-        self._left = masked[len(data) :]  # zeros XOR stream
-        return out + masked[: len(data)] if head else masked[: len(data)]
-
-    def finalize(self) -> bytes:
-        return b""
-
-
-class _CTR:
-    def __init__(self, engine: Engine, nonce: bytes) -> None:
-        self._engine, self._counter = engine, int.from_bytes(nonce)
-
-    def __call__(self, data: bytes) -> bytes:
-        first = self._counter.to_bytes(16)
-        self._counter = (self._counter + len(data) // 16) % (1 << 128)
-        return self._engine.ctr_xor(first, data)
-
-
-class _OFB:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
-
-    def __call__(self, data: bytes) -> bytes:
-        stream = self._engine.cfb_encrypt(self._chain, bytes(len(data)))
-        self._chain = stream[-16:]
-        return xor_bytes(data, stream)
-
-
-class _CFB:
-    """CFB-128. The chain is the ciphertext block before; of a block under way, what has come of it.
-
-    A block under way is masked with what is left of E(the block before).
-    """
-
-    def __init__(self, engine: Engine, iv: bytes, *, encrypting: bool) -> None:
-        self._engine, self._encrypting = engine, encrypting
-        self._chain, self._mask = iv, b""
-
-    def update(self, data: bytes) -> bytes:
-        out = self._within_block(data[: len(self._mask)])
-        data = data[len(out) :]
+        begun = len(self._begun)
+        if begun and len(data) < len(self._mask):
+            mask, self._mask = self._mask[: len(data)], self._mask[len(data) :]
+            self._begun += data
+            return xor_bytes(data, mask)
+        data = self._begun + data
         whole = len(data) & ~15
-        if whole:
-            out += self._blocks(data[:whole])
-        if whole < len(data):
-            self._mask, self._chain = self._engine.encrypt(self._chain), b""
-            out += self._within_block(data[whole:])
-        return out
-
-    def _within_block(self, piece: bytes) -> bytes:
-        out = xor_bytes(piece, self._mask[: len(piece)])
-        self._mask = self._mask[len(piece) :]
-        self._chain += out if self._encrypting else piece
-        return out
-
-    def _blocks(self, blocks: bytes) -> bytes:
-        if self._encrypting:
-            out = self._engine.cfb_encrypt(self._chain, blocks)
-            self._chain = out[-16:]
-            return out
-        chained = self._chain + blocks
-        self._chain = chained[-16:]
-        return self._engine.encrypt(chained[: len(blocks)], blocks)
+        out, self._chain = self._step(self._engine, self._chain, data + bytes(-len(data) % 16), whole)
+        self._begun, self._mask = data[whole:], out[len(data) :]
+        return out[begun : len(data)]
 
     def finalize(self) -> bytes:
         return b""
@@ -351,15 +321,15 @@ def _transform(cipher: Cipher, *, encrypting: bool) -> _Transform:
         return XTSStream(cipher.key, mode.tweak, mode.variant, encrypting=encrypting)
     engine = Engine(cipher.key)
     if isinstance(mode, CTR):
-        return _KeyStream(_CTR(engine, mode.nonce))
+        return _AnyLength(engine, _ctr, mode.nonce)
     if isinstance(mode, OFB):
-        return _KeyStream(_OFB(engine, mode.iv))
+        return _AnyLength(engine, _ofb, mode.iv)
     if isinstance(mode, CFB):
-        return _CFB(engine, mode.iv, encrypting=encrypting)
+        return _AnyLength(engine, _cfb_encrypt if encrypting else _cfb_decrypt, mode.iv)
     if isinstance(mode, ECB):
-        inner = _Blocks(engine.encrypt if encrypting else engine.decrypt)
+        inner = _WholeBlocks(engine, _ecb_encrypt if encrypting else _ecb_decrypt, b"")
     else:
-        inner = _Blocks(_CBCEncrypt(engine, mode.iv) if encrypting else _CBCDecrypt(engine, mode.iv))
+        inner = _WholeBlocks(engine, _cbc_encrypt if encrypting else _cbc_decrypt, mode.iv)
     if cipher.padding is None:
         return inner
     return _Pad(inner) if encrypting else _Unpad(inner)
