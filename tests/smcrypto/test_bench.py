@@ -7,11 +7,11 @@ import os
 import runpy
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tomllib
 
 import smcrypto
 from smcrypto import MissingDependency, bench

@@ -15,6 +15,7 @@ Not here: PBES1 and PKCS#12, OpenSSL's "Proc-Type" encryption, curves other than
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import secrets
@@ -369,7 +370,24 @@ def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
                 f" {MAX_PURE_ITERATIONS}"
             )
         return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length)
-    return lambda password: hashlib.pbkdf2_hmac(hash_name, password, salt, iterations, key_length)
+    return lambda password: _pbkdf2(hash_name, password, salt, iterations, key_length)
+
+
+def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
+    """PBKDF2 with a hash that is not ours (names: RFC 8018, 5.2); hashlib has it only where Python has OpenSSL."""
+    with contextlib.suppress(AttributeError):
+        return hashlib.pbkdf2_hmac(hash_name, P, S, c, dkLen)
+    keyed = hmac.new(P, digestmod=hash_name)
+    output = b""
+    for i in range(1, -(-dkLen // keyed.digest_size) + 1):
+        U, T = S + i.to_bytes(4, "big"), 0
+        for _ in range(c):
+            mac = keyed.copy()
+            mac.update(U)
+            U = mac.digest()
+            T ^= int.from_bytes(U, "big")
+        output += T.to_bytes(keyed.digest_size, "big")
+    return output[:dkLen]
 
 
 def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callable[[bytes], bytes]:
@@ -383,6 +401,8 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
             f"the key file asks for scrypt with N*r = {N * r}, p = {p}; the limits are {MAX_SCRYPT_MEMORY} bytes"
             f" of memory (128*N*r) and N*r*p = {MAX_SCRYPT_BLOCKS}"
         )
+    if not hasattr(hashlib, "scrypt"):
+        raise MissingDependency("the private key is encrypted under scrypt; reading it needs a Python with OpenSSL")
     # OpenSSL counts 32 * (N + p + 2) * 4 * r bytes and small change against maxmem.
     memory = 128 * r * (N + p + 2) + (1 << 16)
     return lambda password: hashlib.scrypt(
@@ -495,7 +515,7 @@ def _encrypted(data: bytes, password: bytes, prf: Prf, iterations: int) -> bytes
         key = kdf.pbkdf2_hmac(password, salt, iterations, 16)
     else:
         function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
-        key = hashlib.pbkdf2_hmac("sha256", password, salt, iterations, 16)
+        key = _pbkdf2("sha256", password, salt, iterations, 16)
     derivation = der.sequence(
         der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function)
     )
