@@ -2,12 +2,13 @@
 
 `sm2` signature, key exchange, encryption (GB/T 32918) · `sm3` hash
 (GB/T 32905) · `sm4` block cipher, modes, AEAD (GB/T 32907, 17964) · `kdf` key
-derivation · `x509` certificates. Importing the package loads none of them:
-each arrives with its first use.
+derivation · `x509` certificates · `diagnose` what somebody gave you. Importing
+the package loads none of them: each arrives with its first use.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from . import sm3 as sm3
     from . import sm4 as sm4
     from . import x509 as x509
+    from .diagnosis import diagnose as diagnose
 
 __version__ = "0.1.0"
 
@@ -53,6 +55,7 @@ __all__ = [
     "MissingDependency",
     "OutOfOrder",
     "SMCryptoError",
+    "diagnose",
     "kdf",
     "sm2",
     "sm3",
@@ -63,11 +66,15 @@ __all__ = [
 _MODULES = frozenset({"kdf", "sm2", "sm3", "sm4", "x509"})
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> ModuleType | Callable[..., object]:
+    if name == "diagnose":
+        from smcrypto.diagnosis import diagnose
+
+        return diagnose
     if name in _MODULES:
         return import_module(f"smcrypto.{name}")
     raise AttributeError(f"module 'smcrypto' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return sorted({*globals(), *_MODULES, "diagnose"})

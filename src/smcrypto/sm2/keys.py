@@ -154,7 +154,7 @@ class PublicKey:
         >>> key.public_key.verify(key.sign(b"message"), b"massage")
         Traceback (most recent call last):
         ...
-        smcrypto.errors.InvalidSignature: the signature does not hold
+        smcrypto.errors.InvalidSignature: the signature does not hold (smcrypto.diagnose tells why it may not)
         """
         data = as_bytes(message, "message")
         e = signatures.message_digest(self._curve, self._point, as_bytes(uid, "uid"), data)
