@@ -2,7 +2,8 @@
 
 `sm2` signature, key exchange, encryption (GB/T 32918) · `sm3` hash
 (GB/T 32905) · `sm4` block cipher, modes, AEAD (GB/T 32907, 17964) · `kdf` key
-derivation · `x509` certificates · `diagnose` what somebody gave you. Importing
+derivation · `x509` certificates · `cms` signed and enveloped messages
+(GB/T 35275) · `pkcs12` files · `diagnose` what somebody gave you. Importing
 the package loads none of them: each arrives with its first use.
 """
 
@@ -31,7 +32,9 @@ from smcrypto.errors import (
 )
 
 if TYPE_CHECKING:
+    from . import cms as cms
     from . import kdf as kdf
+    from . import pkcs12 as pkcs12
     from . import sm2 as sm2
     from . import sm3 as sm3
     from . import sm4 as sm4
@@ -55,15 +58,17 @@ __all__ = [
     "MissingDependency",
     "OutOfOrder",
     "SMCryptoError",
+    "cms",
     "diagnose",
     "kdf",
+    "pkcs12",
     "sm2",
     "sm3",
     "sm4",
     "x509",
 ]
 
-_MODULES = frozenset({"kdf", "sm2", "sm3", "sm4", "x509"})
+_MODULES = frozenset({"cms", "kdf", "pkcs12", "sm2", "sm3", "sm4", "x509"})
 
 
 def __getattr__(name: str) -> ModuleType | Callable[..., object]:

@@ -263,6 +263,10 @@ class Reader:
         inner._require_order()
         return inner
 
+    def set_in_any_order(self) -> Reader:
+        """The elements of a SET OF where a standard asks for BER only (RFC 2315): their order is not looked at."""
+        return self._inner(SET)
+
     def implicit_set_of(self, number: int) -> Reader:
         """As `set_of`, under the implicit tag [number]."""
         inner = self._inner(_CONTEXT | _CONSTRUCTED | number)

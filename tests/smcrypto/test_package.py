@@ -186,6 +186,7 @@ def test_sm3_is_the_only_algorithm_taken_from_hashlib() -> None:
                 asked.add((str(path.relative_to(PACKAGE)), node.attr))
     assert asked == {
         ("sm3.py", "new"), ("kdf.py", "pbkdf2_hmac"),
+        ("pkcs12.py", "new"),  # the MAC of others' files
         ("diagnosis.py", "sha256"),  # that somebody hashed with it instead of SM3
         # Others' key files: PBKDF2 with SHA-1 and SHA-2, and scrypt.
         ("sm2/keyfiles.py", "pbkdf2_hmac"), ("sm2/keyfiles.py", "scrypt"),
