@@ -2,7 +2,8 @@
 
 `SM4GCM` is what new designs want: it hides and protects. `encrypt`, `decrypt`
 and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
-already exist. `SM4` is the bare block.
+already exist; `Cipher` with `GCM` for what does not fit in memory. `cmac` and
+`cbc_mac` authenticate. `SM4` is the bare block.
 
 `ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC): "cryptography"
 where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
@@ -14,11 +15,13 @@ from typing import TYPE_CHECKING
 
 from smcrypto.sm4 import serial
 from smcrypto.sm4.cipher import SM4
+from smcrypto.sm4.mac import cbc_mac, cmac
 from smcrypto.sm4.modes import (
     CBC,
     CFB,
     CTR,
     ECB,
+    GCM,
     OFB,
     XTS,
     Cipher,
@@ -39,6 +42,7 @@ __all__ = [
     "CTR",
     "ECB",
     "ENGINE",
+    "GCM",
     "OFB",
     "SM4",
     "SM4CCM",
@@ -47,6 +51,8 @@ __all__ = [
     "Cipher",
     "CipherStream",
     "Mode",
+    "cbc_mac",
+    "cmac",
     "decrypt",
     "encrypt",
 ]
