@@ -22,9 +22,8 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 FORBIDDEN = {"ctypes", "_ctypes", "cffi", "subprocess", "multiprocessing", "numpy", "random"}
 # Code generated at import, from text in the same file: unrolled rounds, a circuit with its registers reused.
 GENERATED = {"_sm3_compression.py", "sm4/bitslice.py", "sm4/tables.py"}
-# Third-party modules, imported where they are needed and nowhere else: AES and 3DES of others' key files; serial SM4;
-# pictures.
-OPTIONAL = {"sm2/keyfiles.py": {"cryptography"}, "sm4/serial.py": {"cryptography"}, "bench.py": {"matplotlib"}}
+# Third-party modules, imported where they are needed and nowhere else: AES and 3DES of others' key files; serial SM4.
+OPTIONAL = {"sm2/keyfiles.py": {"cryptography"}, "sm4/serial.py": {"cryptography"}}
 
 SMOKE = """
 import hmac
