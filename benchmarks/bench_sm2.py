@@ -1,4 +1,4 @@
-"""SM2 beside gmssl and gmalg, the pure Python peers (pyca/cryptography offers no SM2).
+"""SM2 beside gmssl, gmalg and snowland-smx in pure Python, and gmssl-pyx around GmSSL's C (cryptography has no SM2).
 
 What is timed is what a user calls: signing and verifying take the message (32
 bytes) and hash it with Z, as sign_with_sm3 and verify_with_sm3 of gmssl do.
@@ -33,6 +33,10 @@ def gmssl_key(mode: int = 1) -> Any:
 def gmalg_key(uid: bytes = sm2.DEFAULT_UID) -> Any:
     gmalg = pytest.importorskip("gmalg")
     return gmalg.SM2(D.to_bytes(32, "big"), uid, KEY.public_key.to_bytes())
+
+
+def gmssl_pyx() -> Any:
+    return pytest.importorskip("gmssl_pyx")
 
 
 def run(benchmark: Any, implementation: str, function: Callable[..., Any], *args: Any) -> None:
@@ -72,6 +76,24 @@ def test_sign_smcrypto(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="SM2 sign")
 def test_sign_gmssl(benchmark: Any) -> None:
     run(benchmark, "gmssl", gmssl_key().sign_with_sm3, MESSAGE)
+
+
+@pytest.mark.benchmark(group="SM2 sign")
+def test_sign_gmssl_pyx(benchmark: Any) -> None:
+    run(benchmark, "gmssl-pyx", gmssl_pyx().sm2_sign, KEY.to_bytes(), KEY.public_key.to_bytes()[1:], MESSAGE)
+
+
+@pytest.mark.benchmark(group="SM2 sign")
+def test_sign_snowland(benchmark: Any) -> None:
+    """Of a digest: it has no Z, which costs one hash."""
+    snowland = pytest.importorskip("pysmx.SM2")
+    run(benchmark, "snowland-smx", snowland.Sign, MESSAGE, f"{D:064x}", "12345678901234567890", 64)
+
+
+@pytest.mark.benchmark(group="SM2 verify (key seen before)")
+def test_verify_gmssl_pyx(benchmark: Any) -> None:
+    point = KEY.public_key.to_bytes()[1:]
+    run(benchmark, "gmssl-pyx", gmssl_pyx().sm2_verify, point, MESSAGE, KEY.sign(MESSAGE))
 
 
 @pytest.mark.benchmark(group="SM2 sign")

@@ -1,4 +1,4 @@
-"""`pytest benchmarks/` prints pytest-benchmark's table and writes JSON for `python -m smcrypto.bench`.
+"""`pytest benchmarks/` prints pytest-benchmark's table and writes JSON for `python benchmarks/render.py`.
 
 Each benchmark sets its group (the row of the table) and says in
 extra_info["implementation"] whose code ran; extra_info["bytes"] gives the

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from datetime import datetime, timezone
 
-from smcrypto import SMCryptoError, der, pem, sm2, x509
+from smcrypto import SMCryptoError, cms, der, diagnose, pem, pkcs12, sm2, x509
 from smcrypto.x509 import Certificate, CertificateRevocationList, CertificateSigningRequest, Name
 
 
@@ -73,8 +74,42 @@ def _crl(data: bytes) -> None:
     _require(crl.to_der() == data and repr(crl).isprintable(), "revocation list")
 
 
+_KEY = sm2.PrivateKey.from_int(0x1234567)
+_AT = datetime(2026, 6, 1, tzinfo=timezone.utc)
+_CERTIFICATE = x509.self_signed(_KEY, subject={"CN": "fuzz"}, not_before=_AT, not_after=_AT,
+                                serial_number=1, key_usage=())  # fmt: skip
+
+
+def _cms(data: bytes) -> None:
+    for read in (
+        lambda: cms.verify(data, roots=None, at=_AT),
+        lambda: cms.decrypt(data, _KEY, _CERTIFICATE),
+        lambda: cms.decrypt_and_verify(data, _KEY, _CERTIFICATE, roots=None, at=_AT),
+    ):
+        try:
+            read()
+            return
+        except SMCryptoError as error:
+            refusal = error
+    raise refusal
+
+
+def _pkcs12(data: bytes) -> None:
+    pkcs12.load(data, b"password")
+
+
+def _enveloped_key(data: bytes) -> None:
+    key = sm2.PrivateKey.from_enveloped(data, _KEY)
+    _require(sm2.PrivateKey.from_enveloped(key.to_enveloped(_KEY.public_key), _KEY) == key, "enveloped key")
+
+
+def _diagnose(data: bytes) -> None:
+    _require("\0" not in str(diagnose(data, key=_KEY, message=b"m")), "diagnosis")
+
+
 READERS: tuple[Callable[[bytes], None], ...] = (
-    _der, _pem, _private_key, _public_key, _name, _certificate, _request, _crl,
+    _der, _pem, _private_key, _public_key, _name, _certificate, _request, _crl, _cms, _pkcs12,
+    _enveloped_key, _diagnose,
 )  # fmt: skip
 
 

@@ -30,8 +30,10 @@ from conftest import unavailable
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-EXAMPLES = [ROOT / "README.md", DOCS / "smcrypto.md", DOCS / "migration.md", DOCS / "security.md"]
-PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
+EXAMPLES = [ROOT / "README.md", DOCS / "smcrypto.md", DOCS / "migration.md", DOCS / "security.md",
+            ROOT / "README.zh.md", DOCS / "zh" / "quickstart.md"]  # fmt: skip
+PAGES = sorted([ROOT / "README.md", ROOT / "README.zh.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md",
+                ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
 MODULES = [
     importlib.import_module(module.name)
     for module in pkgutil.walk_packages(smcrypto.__path__, "smcrypto.")
@@ -39,7 +41,8 @@ MODULES = [
 ]
 PUBLIC = [
     smcrypto, *(importlib.import_module(f"smcrypto.{name}") for name in
-                ("errors", "inputs", "sm3", "kdf", "sm4", "sm2", "x509", "der", "pem")),
+                ("errors", "inputs", "sm3", "kdf", "sm4", "sm2", "x509", "der", "pem", "diagnosis",
+                 "cms", "pkcs12")),
 ]  # fmt: skip
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from smcrypto import der, sm2, x509
+
+UTC = timezone.utc
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 BEGIN, END = NOW - timedelta(days=1), NOW + timedelta(days=365)

@@ -15,7 +15,7 @@ Every refusal is InvalidEncoding.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from functools import lru_cache
 from typing import Final
 
@@ -263,6 +263,10 @@ class Reader:
         inner._require_order()
         return inner
 
+    def set_in_any_order(self) -> Reader:
+        """The elements of a SET OF where a standard asks for BER only (RFC 2315): their order is not looked at."""
+        return self._inner(SET)
+
     def implicit_set_of(self, number: int) -> Reader:
         """As `set_of`, under the implicit tag [number]."""
         inner = self._inner(_CONTEXT | _CONSTRUCTED | number)
@@ -389,7 +393,7 @@ def _parse_time(tag: int, content: bytes) -> datetime:
         text = ("19" if text >= "50" else "20") + text
     year, rest = int(text[:4]), [int(text[i : i + 2]) for i in range(4, 14, 2)]
     try:
-        return datetime(year, rest[0], rest[1], rest[2], rest[3], rest[4], tzinfo=UTC)
+        return datetime(year, rest[0], rest[1], rest[2], rest[3], rest[4], tzinfo=timezone.utc)
     except ValueError:
         raise InvalidEncoding(f"there is no time {text}Z") from None
 
@@ -502,13 +506,13 @@ def utf8_string(text: str) -> bytes:
 
 def generalized_time(moment: datetime) -> bytes:
     """`moment`, an aware datetime, in UTC and whole seconds (a fraction is cut off)."""
-    utc = moment.astimezone(UTC)
+    utc = moment.astimezone(timezone.utc)
     return element(GENERALIZED_TIME, f"{utc:%Y%m%d%H%M%SZ}".rjust(15, "0").encode("ascii"))
 
 
 def time(moment: datetime) -> bytes:
     """A Time of RFC 5280, 4.1.2.5: UTCTime for the years 1950 to 2049, else GeneralizedTime."""
-    utc = moment.astimezone(UTC)
+    utc = moment.astimezone(timezone.utc)
     if 1950 <= utc.year <= 2049:
         return element(UTC_TIME, f"{utc:%y%m%d%H%M%SZ}".encode("ascii"))
     return generalized_time(utc)

@@ -35,7 +35,7 @@ class InvalidLength(SMCryptoError, ValueError):
 
 
 class InvalidOption(SMCryptoError, ValueError):
-    """An option has a value that does not exist (`encoding="hex"`, `padding="zero"`)."""
+    """An option has a value that does not exist (`encoding="hex"`, `padding="none"`)."""
 
 
 class InvalidKey(SMCryptoError, ValueError):
@@ -59,7 +59,7 @@ class InvalidTag(SMCryptoError, ValueError):
 
 
 class InvalidPadding(SMCryptoError, ValueError):
-    """A padded ciphertext did not decrypt to well-formed PKCS#7 padding."""
+    """A padded ciphertext did not decrypt to well-formed padding."""
 
 
 class ConfirmationError(SMCryptoError, ValueError):

@@ -20,9 +20,10 @@ from smcrypto.inputs import BytesLike, as_bytes
 
 __all__ = ["Block", "decode", "encode", "first"]
 
-# RFC 7468, 3: label characters are printable but "-", single "-" and spaces between them. Possessive, so that a
-# line which is no boundary is given up at once, without a memory of every place where it could have been cut.
-_BOUNDARY: Final = re.compile(rb"-----(BEGIN|END) ([!-,.-~]++(?:[ -][!-,.-~]++)*+)-----[ \t]*")
+_BOUNDARY: Final = re.compile(rb"-----(BEGIN|END) ([ -~]+)-----[ \t]*")
+# RFC 7468, 3: of the printable characters, "-" and the space stand only singly and between others. (One expression for
+# both would remember every place where a long line could be cut.)
+_NO_LABEL: Final = re.compile(rb"^[ -]|[ -]{2}|[ -]$")
 _LINE_END: Final = re.compile(rb"\r\n|\n|\r")
 
 
@@ -48,6 +49,8 @@ def decode(data: BytesLike) -> list[Block]:
     body: list[bytes] = []
     for line in _LINE_END.split(as_bytes(data, "data")):
         match = _BOUNDARY.fullmatch(line)
+        if match and _NO_LABEL.search(match[2]):
+            match = None
         if label is None:
             if match and match[1] == b"BEGIN":
                 label, body = match[2], []
@@ -77,9 +80,9 @@ def _unarmoured(lines: list[bytes]) -> bytes:
         raise InvalidEncoding("the PEM block has RFC 1421 headers; such encryption is not supported")
     text = b"".join(lines)
     try:
-        der = binascii.a2b_base64(text, strict_mode=True)
+        der = binascii.a2b_base64(text)
     except binascii.Error:
         raise InvalidEncoding("the PEM block is not base64") from None
-    if binascii.b2a_base64(der, newline=False) != text:
-        raise InvalidEncoding("the PEM block's base64 has stray bits at its end")
+    if binascii.b2a_base64(der, newline=False) != text:  # the decoder skips what is no base64
+        raise InvalidEncoding("the PEM block's base64 has stray bits at its end, or other characters in it")
     return der

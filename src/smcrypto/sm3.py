@@ -12,9 +12,12 @@ from __future__ import annotations
 import hashlib
 import hmac as _hmac
 import os
-from typing import ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from smcrypto.inputs import BytesLike, as_bytes
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 __all__ = ["ENGINE", "SM3", "digest", "hmac", "new"]
 

@@ -1,22 +1,28 @@
-"""`python -m smcrypto.bench`: what a report of pytest-benchmark becomes, and what it does with one that is none."""
+"""`python benchmarks/render.py`: what a report of pytest-benchmark becomes, and what it does with one that is none."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import runpy
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import smcrypto
-from smcrypto import MissingDependency, bench
+from smcrypto import MissingDependency
 
 ROOT = Path(__file__).resolve().parents[2]
+RENDER = ROOT / "benchmarks" / "render.py"
+_SPEC = importlib.util.spec_from_file_location("benchmarks_render", RENDER)
+assert _SPEC is not None and _SPEC.loader is not None
+bench = importlib.util.module_from_spec(_SPEC)
+sys.modules["benchmarks_render"] = bench
+_SPEC.loader.exec_module(bench)
 
 
 def entry(group: str | None, implementation: str | None, median: float, size: int | None = None) -> dict[str, Any]:
@@ -147,9 +153,8 @@ def test_a_table_that_cannot_be_written_is_one_line(
 def test_it_runs_as_a_program(results: Path, report: dict[str, Any], capsys: pytest.CaptureFixture[str],
                               monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
     monkeypatch.setattr(sys, "argv", ["bench", str(results)])
-    monkeypatch.delitem(sys.modules, "smcrypto.bench")
     with pytest.raises(SystemExit) as exit:
-        runpy.run_module("smcrypto.bench", run_name="__main__")
+        runpy.run_path(str(RENDER), run_name="__main__")
     assert exit.value.code == 0 and capsys.readouterr().out == bench.markdown(report)
 
 
@@ -173,5 +178,5 @@ def test_a_real_run_is_read(tmp_path: Path) -> None:
 
 def test_the_peers_are_pinned_where_a_figure_names_their_version() -> None:
     """The README's ratios are against gmssl 3.2.2."""
-    dev = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["dev"]
-    assert "gmssl==3.2.2" in dev
+    project = pytest.importorskip("tomllib").loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert "gmssl==3.2.2" in project["optional-dependencies"]["dev"]

@@ -5,13 +5,15 @@ from __future__ import annotations
 import stat
 import subprocess
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
 
 from smcrypto import der, pem, sm2, x509
 from smcrypto.cli import main
+
+UTC = timezone.utc
 
 PASSWORD = ("--password-file", "password")
 

@@ -13,13 +13,15 @@ import inspect
 import pickle
 from array import array
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from typing import Any, NamedTuple
 
 import pytest
 
 import smcrypto
 from smcrypto import kdf, sm2, sm3, sm4, x509
+
+UTC = timezone.utc
 
 KEY16, KEY32, IV = bytes(range(16)), bytes(range(32)), bytes(range(100, 116))
 NOW = datetime(2026, 6, 1, tzinfo=UTC)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from typing import Any
 
 import pytest
@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smcrypto import InvalidEncoding, der
+
+UTC = timezone.utc
 
 
 def one(data: bytes, read: Callable[[der.Reader], Any]) -> Any:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smcrypto import sm2, x509
+from smcrypto import cms, pkcs12, sm2, x509
 from x509_authority import NOW, root
 
 PATH = Path(__file__).resolve().parents[2] / "fuzz" / "parsers.py"
@@ -30,10 +30,14 @@ FILES = [
     ROOT.certificate.to_pem(),
     x509.CertificateSigningRequest.create(KEY, subject={"CN": "robot"}, subject_alt_names=("DNS:a",)).to_der(),
     ROOT.crl(x509.RevokedCertificate(7, NOW, "superseded")).to_der(),
+    cms.sign(b"m", parsers._KEY, parsers._CERTIFICATE, signing_time=NOW),
+    cms.encrypt(b"m", [parsers._CERTIFICATE]),
+    pkcs12.dump([pkcs12.Entry(KEY)], b"password", iterations=2),
+    KEY.to_enveloped(parsers._KEY.public_key),
 ]
 
 
-@given(st.integers(0, 7), st.sampled_from(FILES), st.data())
+@given(st.integers(0, len(parsers.READERS) - 1), st.sampled_from(FILES), st.data())
 def test_altered_files_break_no_invariant(reader: int, file: bytes, draw: st.DataObject) -> None:
     data = bytearray(file)
     for _ in range(draw.draw(st.integers(0, 3))):

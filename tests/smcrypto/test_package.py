@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,12 +22,12 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 FORBIDDEN = {"ctypes", "_ctypes", "cffi", "subprocess", "multiprocessing", "numpy", "random"}
 # Code generated at import, from text in the same file: unrolled rounds, a circuit with its registers reused.
 GENERATED = {"_sm3_compression.py", "sm4/bitslice.py", "sm4/tables.py"}
-# Third-party modules, imported where they are needed and nowhere else: AES and 3DES of others' key files; pictures.
-OPTIONAL = {"sm2/keyfiles.py": {"cryptography"}, "bench.py": {"matplotlib"}}
+# Third-party modules, imported where they are needed and nowhere else: AES and 3DES of others' key files; serial SM4.
+OPTIONAL = {"sm2/keyfiles.py": {"cryptography"}, "sm4/serial.py": {"cryptography"}}
 
 SMOKE = """
 import hmac
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from smcrypto import kdf, sm2, sm3, sm4, x509
 hmac.new(kdf.hkdf(b"k", 16), b"m", sm3.SM3).digest()
 for aead in (sm4.SM4GCM(bytes(16)), sm4.SM4CCM(bytes(16))):
@@ -38,7 +37,7 @@ key = sm2.PrivateKey.generate()
 key.public_key.verify(key.sign(b"m"), b"m")
 assert key.decrypt(key.public_key.encrypt(b"m")) == b"m"
 assert sm2.PrivateKey.from_pem(key.to_pem()) == key
-now = datetime(2026, 1, 1, tzinfo=UTC)
+now = datetime(2026, 1, 1, tzinfo=timezone.utc)
 root = x509.self_signed(key, subject={"CN": "root"}, not_before=now, not_after=now + timedelta(1))
 x509.verify_chain(root, roots=[root], at=now)
 """
@@ -186,6 +185,8 @@ def test_sm3_is_the_only_algorithm_taken_from_hashlib() -> None:
                 asked.add((str(path.relative_to(PACKAGE)), node.attr))
     assert asked == {
         ("sm3.py", "new"), ("kdf.py", "pbkdf2_hmac"),
+        ("pkcs12.py", "new"),  # the MAC of others' files
+        ("diagnosis.py", "sha256"),  # that somebody hashed with it instead of SM3
         # Others' key files: PBKDF2 with SHA-1 and SHA-2, and scrypt.
         ("sm2/keyfiles.py", "pbkdf2_hmac"), ("sm2/keyfiles.py", "scrypt"),
     }  # fmt: skip
@@ -231,6 +232,7 @@ def test_errors_of_the_package_have_no_other_home() -> None:
 
 
 def test_the_library_requires_nothing() -> None:
+    tomllib = pytest.importorskip("tomllib")  # Python 3.11
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["dependencies"] == [] and "dependencies" not in project.get("dynamic", [])
     assert project["version"] == smcrypto.__version__
@@ -248,5 +250,6 @@ def test_every_folder_of_the_package_is_shipped() -> None:
     """setuptools finds packages by their __init__.py."""
     assert {path.parent for path in SOURCES} == {path.parent for path in PACKAGE.rglob("__init__.py")}
     assert (PACKAGE / "py.typed").exists()
+    tomllib = pytest.importorskip("tomllib")
     data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     assert "py.typed" in data["smcrypto"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from smcrypto import pem, sm2, x509
@@ -132,7 +132,7 @@ def _add_authority(parser: argparse.ArgumentParser) -> None:
 def _days(options: argparse.Namespace) -> tuple[datetime, datetime]:
     if not 1 <= options.days <= 36525:
         raise InvalidOption("--days must be between 1 and 36525, a hundred years")
-    now = datetime.now(UTC).replace(microsecond=0)
+    now = datetime.now(timezone.utc).replace(microsecond=0)
     return now, now + timedelta(days=options.days)
 
 
@@ -247,9 +247,9 @@ def run_verify(options: argparse.Namespace) -> int:
 
 def _moment(text: str | None) -> datetime:
     if text is None:
-        return datetime.now(UTC)
+        return datetime.now(timezone.utc)
     try:
-        return datetime.fromisoformat(text)
+        return datetime.fromisoformat(text[:-1] + "+00:00" if text.endswith("Z") else text)  # Python 3.10 knows no Z
     except ValueError:
         raise InvalidOption("--at takes a time such as 2026-01-31T12:00:00Z") from None
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from hmac import compare_digest
+from typing import Final
 
 from smcrypto import der, sm3
 from smcrypto.errors import InvalidCiphertext, InvalidEncoding, InvalidKey, InvalidOption
@@ -23,7 +24,8 @@ from smcrypto.sm2.points import base_comb, secret_sum, to_affine_all
 
 __all__ = ["decode_ciphertext", "decrypt", "encode_ciphertext", "encrypt"]
 
-_C3_BYTES = 32
+REFUSED: Final = "not a ciphertext for this key (smcrypto.diagnose tells what it is)"
+_C3_BYTES: Final = 32
 
 
 def encrypt(curve: Curve, P: Point, message: bytes, nonces: Iterator[int]) -> tuple[Point, bytes, bytes]:
@@ -48,7 +50,7 @@ def decrypt(curve: Curve, d: int, C1: Point, C3: bytes, C2: bytes) -> bytes:
     message = _mask(x2 + y2, C2)
     # B4 and B6 fail alike.
     if message is None or not compare_digest(sm3.digest(x2 + message + y2), C3):
-        raise InvalidCiphertext("not a ciphertext for this key")
+        raise InvalidCiphertext(REFUSED)
     return message
 
 
@@ -90,9 +92,9 @@ def decode_ciphertext(ciphertext: bytes, curve: Curve, encoding: str) -> tuple[P
             cut = _C3_BYTES if encoding == "c1c3c2" else max(len(rest) - _C3_BYTES, 0)
             C3, C2 = (rest[:cut], rest[cut:]) if encoding == "c1c3c2" else (rest[cut:], rest[:cut])
     except (InvalidEncoding, InvalidKey):
-        raise InvalidCiphertext("not a ciphertext for this key") from None
+        raise InvalidCiphertext(REFUSED) from None
     if len(C3) != _C3_BYTES:
-        raise InvalidCiphertext("not a ciphertext for this key")
+        raise InvalidCiphertext(REFUSED)
     return C1, C3, C2
 
 

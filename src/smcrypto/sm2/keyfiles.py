@@ -10,11 +10,12 @@ Encrypted keys are written as GmSSL writes them, SM4-CBC under
 PBKDF2-HMAC-SM3; read are also AES and 3DES, under PBKDF2 with the other common
 hashes and under scrypt. How much work a file can ask for is bounded.
 
-Not here: PBES1 and PKCS#12, OpenSSL's "Proc-Type" encryption, curves other than sm2p256v1.
+Not here: PBES1, PKCS#12 (pkcs12), OpenSSL's "Proc-Type" encryption, curves other than sm2p256v1.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import secrets
@@ -36,6 +37,8 @@ __all__ = [
     "dump_public",
     "load_private",
     "load_public",
+    "read_pbes2",
+    "write_pbes2",
 ]
 
 Form = Literal["pem", "der"]
@@ -300,9 +303,25 @@ def _decrypted(data: bytes, password: bytes | None) -> int:
     scheme = info.sequence()
     ciphertext = info.octet_string()
     info.finish()
+    decrypt = read_pbes2(scheme, "the key")
+    if password is None:
+        raise InvalidKey("the private key is encrypted; a password is needed")
+    try:
+        return _read_pkcs8(decrypt(password, ciphertext))
+    except (InvalidEncoding, InvalidPadding):
+        # One undetailed failure: how a decryption went wrong says something about the plaintext.
+        raise InvalidKey("the password is wrong, or the key file is damaged") from None
+
+
+def read_pbes2(scheme: der.Reader, what: str) -> Callable[[bytes, bytes], bytes]:
+    """The decryption that a PBES2 AlgorithmIdentifier describes, RFC 8018, A.4: of (password, ciphertext).
+
+    That raises InvalidPadding where the password is wrong, most of the time. InvalidEncoding: an algorithm that is
+    not supported; InvalidKey: one that asks for too much work.
+    """
     name = scheme.oid()
     if name != _PBES2:
-        raise InvalidEncoding(f"the key is encrypted by {name}; PBES2 is what is supported")
+        raise InvalidEncoding(f"{what} is encrypted by {name}; PBES2 is what is supported")
     parameters = scheme.sequence()
     scheme.finish()
     derivation = parameters.sequence()
@@ -310,20 +329,14 @@ def _decrypted(data: bytes, password: bytes | None) -> int:
     parameters.finish()
     cipher_name = cipher.oid()
     if cipher_name not in _CIPHERS:
-        raise InvalidEncoding(f"the key is encrypted with cipher {cipher_name}, which is not supported")
+        raise InvalidEncoding(f"{what} is encrypted with cipher {cipher_name}, which is not supported")
     algorithm, key_length, block = _CIPHERS[cipher_name]
     iv = cipher.octet_string()
     cipher.finish()
     if len(iv) != block:
         raise InvalidEncoding(f"the IV has {len(iv)} bytes, not {block}")
     derive = _read_derivation(derivation, key_length)
-    if password is None:
-        raise InvalidKey("the private key is encrypted; a password is needed")
-    try:
-        return _read_pkcs8(_cbc_decrypt(algorithm, derive(password), iv, ciphertext))
-    except (InvalidEncoding, InvalidPadding):
-        # One undetailed failure: how a decryption went wrong says something about the plaintext.
-        raise InvalidKey("the password is wrong, or the key file is damaged") from None
+    return lambda password, ciphertext: _cbc_decrypt(algorithm, derive(password), iv, ciphertext)
 
 
 def _read_derivation(algorithm: der.Reader, key_length: int) -> Callable[[bytes], bytes]:
@@ -369,7 +382,24 @@ def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
                 f" {MAX_PURE_ITERATIONS}"
             )
         return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length)
-    return lambda password: hashlib.pbkdf2_hmac(hash_name, password, salt, iterations, key_length)
+    return lambda password: _pbkdf2(hash_name, password, salt, iterations, key_length)
+
+
+def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
+    """PBKDF2 with a hash that is not ours (names: RFC 8018, 5.2); hashlib has it only where Python has OpenSSL."""
+    with contextlib.suppress(AttributeError):
+        return hashlib.pbkdf2_hmac(hash_name, P, S, c, dkLen)
+    keyed = hmac.new(P, digestmod=hash_name)
+    output = b""
+    for i in range(1, -(-dkLen // keyed.digest_size) + 1):
+        U, T = S + i.to_bytes(4, "big"), 0
+        for _ in range(c):
+            mac = keyed.copy()
+            mac.update(U)
+            U = mac.digest()
+            T ^= int.from_bytes(U, "big")
+        output += T.to_bytes(keyed.digest_size, "big")
+    return output[:dkLen]
 
 
 def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callable[[bytes], bytes]:
@@ -383,6 +413,8 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
             f"the key file asks for scrypt with N*r = {N * r}, p = {p}; the limits are {MAX_SCRYPT_MEMORY} bytes"
             f" of memory (128*N*r) and N*r*p = {MAX_SCRYPT_BLOCKS}"
         )
+    if not hasattr(hashlib, "scrypt"):
+        raise MissingDependency("the private key is encrypted under scrypt; reading it needs a Python with OpenSSL")
     # OpenSSL counts 32 * (N + p + 2) * 4 * r bytes and small change against maxmem.
     memory = 128 * r * (N + p + 2) + (1 << 16)
     return lambda password: hashlib.scrypt(
@@ -482,10 +514,18 @@ def _algorithm() -> bytes:
 
 
 def _encrypted(data: bytes, password: bytes, prf: Prf, iterations: int) -> bytes:
+    algorithm, ciphertext = write_pbes2(data, password, prf, iterations)
+    return der.sequence(algorithm, der.octet_string(ciphertext))
+
+
+def write_pbes2(data: bytes, password: bytes, prf: Prf, iterations: int) -> tuple[bytes, bytes]:
+    """(AlgorithmIdentifier, ciphertext): PBES2 with SM4-CBC, fresh salt and IV. InvalidOption as of `dump_private`."""
     from smcrypto import kdf, sm4
 
     if not password:
         raise InvalidOption("an empty password protects nothing; leave it out to write the key unencrypted")
+    if prf not in ("sm3", "sha256"):
+        raise InvalidOption(f"prf must be 'sm3' or 'sha256', not {prf!r}")
     if not 1 <= iterations <= MAX_ITERATIONS:
         raise InvalidOption(f"iterations must be between 1 and {MAX_ITERATIONS}, not {iterations}")
     salt, iv = secrets.token_bytes(16), secrets.token_bytes(16)
@@ -495,12 +535,10 @@ def _encrypted(data: bytes, password: bytes, prf: Prf, iterations: int) -> bytes
         key = kdf.pbkdf2_hmac(password, salt, iterations, 16)
     else:
         function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
-        key = hashlib.pbkdf2_hmac("sha256", password, salt, iterations, 16)
+        key = _pbkdf2("sha256", password, salt, iterations, 16)
     derivation = der.sequence(
         der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function)
     )
     cipher = der.sequence(der.oid(_SM4_CBC), der.octet_string(iv))
-    return der.sequence(
-        der.sequence(der.oid(_PBES2), der.sequence(derivation, cipher)),
-        der.octet_string(sm4.encrypt(key, sm4.CBC(iv), data, padding="pkcs7")),
-    )
+    algorithm = der.sequence(der.oid(_PBES2), der.sequence(derivation, cipher))
+    return algorithm, sm4.encrypt(key, sm4.CBC(iv), data, padding="pkcs7")

@@ -15,7 +15,7 @@ from typing import Any, Literal, NoReturn
 
 from smcrypto import sm3
 from smcrypto.errors import InvalidKey
-from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes, require_int
+from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes, require_int, require_type
 from smcrypto.sm2 import encryption
 from smcrypto.sm2 import signature as signatures
 from smcrypto.sm2.curve import SM2P256V1, Curve, Point, decode_point, encode_point, require_point
@@ -154,7 +154,7 @@ class PublicKey:
         >>> key.public_key.verify(key.sign(b"message"), b"massage")
         Traceback (most recent call last):
         ...
-        smcrypto.errors.InvalidSignature: the signature does not hold
+        smcrypto.errors.InvalidSignature: the signature does not hold (smcrypto.diagnose tells why it may not)
         """
         data = as_bytes(message, "message")
         e = signatures.message_digest(self._curve, self._point, as_bytes(uid, "uid"), data)
@@ -380,6 +380,29 @@ class PrivateKey:
         True
         """
         return self._dump(password, format, "der", prf)
+
+    def to_enveloped(self, recipient: PublicKey) -> bytes:
+        """The key sealed for `recipient`: SM2EnvelopedKey in DER (GM/T 0009, 7.4), as a CA hands out encryption keys.
+
+        >>> key, ours = PrivateKey.generate(), PrivateKey.generate()
+        >>> PrivateKey.from_enveloped(key.to_enveloped(ours.public_key), ours) == key
+        True
+        """
+        from smcrypto.sm2.envelope import seal_key
+
+        require_type(recipient, PublicKey, "recipient")
+        return seal_key(self, recipient)
+
+    @classmethod
+    def from_enveloped(cls, data: BytesLike, key: PrivateKey) -> PrivateKey:
+        """The key that was sealed for `key`: SM2EnvelopedKey in DER (GM/T 0009, 7.4).
+
+        InvalidKey: malformed, or not the key of the public key beside it. InvalidCiphertext: sealed for another key.
+        """
+        from smcrypto.sm2.envelope import open_key
+
+        require_type(key, PrivateKey, "key")
+        return open_key(as_bytes(data, "data"), key)
 
     def _dump(
         self,

@@ -24,6 +24,8 @@ __all__ = ["DEFAULT_UID", "decode_signature", "encode_signature", "message_diges
 DEFAULT_UID: Final = b"1234567812345678"
 """The distinguishing identifier where none was agreed (GM/T 0009-2012, clause 10)."""
 
+# One text for every reason to refuse (as of decryption), and where to look on one's own desk.
+REFUSED: Final = "the signature does not hold (smcrypto.diagnose tells why it may not)"
 _MAX_UID: Final = 8191  # ENTL_A counts bits in two bytes (GB/T 32918.2, 5.5)
 
 
@@ -65,11 +67,11 @@ def verify(curve: Curve, P: Point, e: int, r: int, s: int) -> None:
     n, p = curve.n, curve.p
     t = (r + s) % n
     if not (0 < r < n and 0 < s < n) or t == 0:
-        raise InvalidSignature("the signature does not hold")
+        raise InvalidSignature(REFUSED)
     X, _, ZZ, _ = public_sum(curve, (s, base_comb(curve)), (t, known_keys.comb(curve, P) or P))
     # B7, R = (e + x) mod n = r, without the inversion for x: X = x Z^2 for an x = r - e modulo n below p.
     if ZZ == 0 or all((x * ZZ - X) % p for x in range((r - e) % n, p, n)):
-        raise InvalidSignature("the signature does not hold")
+        raise InvalidSignature(REFUSED)
     known_keys.used(curve, P)
 
 
@@ -85,7 +87,7 @@ def decode_signature(signature: bytes, curve: Curve, encoding: str) -> tuple[int
     if encoding == "raw":
         size = curve.scalar_bytes
         if len(signature) != 2 * size:
-            raise InvalidSignature("the signature does not hold")
+            raise InvalidSignature(REFUSED)
         return int.from_bytes(signature[:size], "big"), int.from_bytes(signature[size:], "big")
     try:
         whole = der.Reader(signature)
@@ -94,7 +96,7 @@ def decode_signature(signature: bytes, curve: Curve, encoding: str) -> tuple[int
         r, s = body.integer(), body.integer()
         body.finish()
     except InvalidEncoding:
-        raise InvalidSignature("the signature does not hold") from None
+        raise InvalidSignature(REFUSED) from None
     return r, s
 
 

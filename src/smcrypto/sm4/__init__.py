@@ -2,19 +2,26 @@
 
 `SM4GCM` is what new designs want: it hides and protects. `encrypt`, `decrypt`
 and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
-already exist. `SM4` is the bare block.
+already exist; `Cipher` with `GCM` for what does not fit in memory. `cmac` and
+`cbc_mac` authenticate. `SM4` is the bare block.
+
+`ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC): "cryptography"
+where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from smcrypto.sm4 import serial
 from smcrypto.sm4.cipher import SM4
+from smcrypto.sm4.mac import cbc_mac, cmac
 from smcrypto.sm4.modes import (
     CBC,
     CFB,
     CTR,
     ECB,
+    GCM,
     OFB,
     XTS,
     Cipher,
@@ -27,11 +34,15 @@ from smcrypto.sm4.modes import (
 if TYPE_CHECKING:
     from smcrypto.sm4.aead import SM4CCM, SM4GCM
 
+    ENGINE: str
+
 __all__ = [
     "CBC",
     "CFB",
     "CTR",
     "ECB",
+    "ENGINE",
+    "GCM",
     "OFB",
     "SM4",
     "SM4CCM",
@@ -40,13 +51,17 @@ __all__ = [
     "Cipher",
     "CipherStream",
     "Mode",
+    "cbc_mac",
+    "cmac",
     "decrypt",
     "encrypt",
 ]
 
 
-def __getattr__(name: str) -> type:
-    """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD."""
+def __getattr__(name: str) -> type | str:
+    """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD. ENGINE may change."""
+    if name == "ENGINE":
+        return serial.ENGINE
     if name in ("SM4CCM", "SM4GCM"):
         from smcrypto.sm4 import aead
 

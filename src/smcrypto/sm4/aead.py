@@ -22,7 +22,7 @@ __all__ = ["SM4CCM", "SM4GCM"]
 _ZERO = bytes(16)
 _ONE = b"\0\0\0\1"
 # SP 800-38D, 5.2.1.1: 2^39 - 256 bits of plaintext, 2^64 - 1 bits of associated data and of nonce (whole bytes).
-_GCM_TEXT = 2**36 - 32
+GCM_TEXT = 2**36 - 32
 _GCM_BYTES = 2**61 - 1
 _ONE_PASS = 4096  # bytes up to which decryption makes E(K, J_0) and the key stream together
 
@@ -129,7 +129,7 @@ def _inc32(block: bytes) -> bytes:
 def _check_gcm_lengths(nonce: int, text: int, A: int) -> None:
     if not 1 <= nonce <= _GCM_BYTES:
         raise InvalidLength("nonce must be 1 byte or more")
-    if text > _GCM_TEXT:
+    if text > GCM_TEXT:
         raise InvalidLength(f"GCM takes at most 2^36 - 32 bytes (SP 800-38D, 5.2.1.1), not {text}")
     if A > _GCM_BYTES:
         raise InvalidLength("associated_data must be below 2^61 bytes (SP 800-38D, 5.2.1.1)")

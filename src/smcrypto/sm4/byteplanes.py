@@ -37,14 +37,14 @@ _H = bytes(b >> 6 ^ b for b in SBOX)
 
 def words_from_bytes(data: bytes) -> list[int]:
     """The four words of whole blocks."""
-    return [int.from_bytes(b"".join([data[i::16] for i in range(j, j + 4)])) for j in (0, 4, 8, 12)]
+    return [int.from_bytes(b"".join([data[i::16] for i in range(j, j + 4)]), "big") for j in (0, 4, 8, 12)]
 
 
 def words_to_bytes(words: Sequence[int], n: int) -> bytes:
     """The 16 * n bytes of four words."""
     out = bytearray(16 * n)
     for w, word in enumerate(words):
-        run = word.to_bytes(4 * n)
+        run = word.to_bytes(4 * n, "big")
         for j in range(4):
             out[4 * w + j :: 16] = run[j * n : j * n + n]
     return bytes(out)
@@ -59,7 +59,7 @@ def key_words(rk: Sequence[int], n: int) -> list[int]:
             runs[i::n] = key_bytes
     else:
         runs = bytearray().join(map(mul, struct.unpack("128c", key_bytes), repeat(n)))
-    return list(map(int.from_bytes, struct.unpack(f"{4 * n}s" * 32, runs)))
+    return [int.from_bytes(run, "big") for run in struct.unpack(f"{4 * n}s" * 32, runs)]
 
 
 def crypt_words(keys: Sequence[int], words: Sequence[int], n: int) -> list[int]:
@@ -71,16 +71,16 @@ def crypt_words(keys: Sequence[int], words: Sequence[int], n: int) -> list[int]:
     keys_in_pairs = iter(keys)
     for k0, k1 in zip(keys_in_pairs, keys_in_pairs, strict=True):
         shared = c ^ d  # X_(i+2) ^ X_(i+3) enters this round and the next
-        t = (shared ^ b ^ k0).to_bytes(size)
+        t = (shared ^ b ^ k0).to_bytes(size, "big")
         f = t.translate(F)
-        y = from_bytes(t.translate(H)) ^ from_bytes(f[head:] + f[:head])
+        y = from_bytes(t.translate(H), "big") ^ from_bytes(f[head:] + f[:head], "big")
         s = y ^ y >> two
         s = (s ^ s >> one) & last_byte  # y_0 ^ y_1 ^ y_2 ^ y_3
         s |= s << one
         a ^= y ^ s ^ s << two
-        t = (shared ^ a ^ k1).to_bytes(size)
+        t = (shared ^ a ^ k1).to_bytes(size, "big")
         f = t.translate(F)
-        y = from_bytes(t.translate(H)) ^ from_bytes(f[head:] + f[:head])
+        y = from_bytes(t.translate(H), "big") ^ from_bytes(f[head:] + f[:head], "big")
         s = y ^ y >> two
         s = (s ^ s >> one) & last_byte
         s |= s << one

@@ -17,7 +17,7 @@ import struct
 from collections.abc import Sequence
 
 from smcrypto.errors import InvalidKey
-from smcrypto.sm4 import bitslice, byteplanes, tables
+from smcrypto.sm4 import bitslice, byteplanes, serial, tables
 
 __all__ = ["Engine", "counter_blocks", "xor_bytes"]
 
@@ -27,17 +27,17 @@ BULK_BLOCKS = 2560  # from here: bit slices; in between: byte planes
 
 def xor_bytes(a: bytes, b: bytes) -> bytes:
     """a XOR b, of equal lengths."""
-    return (int.from_bytes(a) ^ int.from_bytes(b)).to_bytes(len(a))
+    return (int.from_bytes(a, "big") ^ int.from_bytes(b, "big")).to_bytes(len(a), "big")
 
 
 def counter_blocks(first: bytes, n: int, counter_bits: int) -> bytes:
     """The blocks `first`, `first` + 1, ...: the low `counter_bits` count, big-endian, and wrap."""
-    number = int.from_bytes(first)
+    number = int.from_bytes(first, "big")
     low = number & 0xFFFFFFFF
     modulus = 1 << counter_bits
     if number % modulus + n > modulus or low + n > 1 << 32:  # a wrap, or a carry beyond the last word: plainly
         fixed = number & -modulus
-        return b"".join([(fixed | (number + i) % modulus).to_bytes(16) for i in range(n)])
+        return b"".join([(fixed | (number + i) % modulus).to_bytes(16, "big") for i in range(n)])
     blocks = bytearray(first * n)
     last_words = struct.pack(f">{n}I", *range(low, low + n))
     for j in range(4):
@@ -79,14 +79,15 @@ class Engine:
     key: 16 bytes, otherwise InvalidKey.
     encrypt, decrypt   whole, independent blocks, any number in one call
     ctr_xor            the counter mode's stream over data of any length
-    cbc_encrypt, ...   what is serial by nature, block after block
+    cbc_encrypt        what is serial by nature, block after block
     """
 
-    __slots__ = ("_decrypting", "_encrypting")
+    __slots__ = ("_decrypting", "_encrypting", "_key")
 
     def __init__(self, key: bytes) -> None:
         if len(key) != 16:
             raise InvalidKey(f"an SM4 key is 16 bytes, not {len(key)}")
+        self._key = key
         rk = tables.expand_key(key)
         self._encrypting = _RoundKeys(rk)
         self._decrypting = _RoundKeys(rk[::-1])
@@ -118,7 +119,7 @@ class Engine:
         """
         n = -(-len(data) // 16)
         if n >= BULK_BLOCKS:
-            return self.encrypt(blocks), self._ctr_bulk(int.from_bytes(first), data, n, counter_bits)
+            return self.encrypt(blocks), self._ctr_bulk(int.from_bytes(first, "big"), data, n, counter_bits)
         out = self.encrypt(blocks + counter_blocks(first, n, counter_bits))
         split = len(blocks)
         return out[:split], xor_bytes(data, out[split : split + len(data)])
@@ -136,11 +137,7 @@ class Engine:
 
     def cbc_encrypt(self, chain: bytes, blocks: bytes) -> bytes:
         """C_i = E(P_i ^ C_(i-1)), C_0 being `chain`. The last block is the CBC-MAC."""
-        return tables.cbc_encrypt(self._encrypting.rk, chain, blocks)
-
-    def cfb_encrypt(self, chain: bytes, blocks: bytes) -> bytes:
-        """C_i = P_i ^ E(C_(i-1)), C_0 being `chain`. On zeros this is OFB's key stream."""
-        return tables.cfb_encrypt(self._encrypting.rk, chain, blocks)
+        return serial.cbc_encrypt(self._key, self._encrypting.rk, chain, blocks)
 
 
 def _crypt(keys: _RoundKeys, blocks: bytes, mask: bytes | None) -> bytes:

@@ -1,11 +1,11 @@
-"""Modes of operation for SM4, GB/T 17964-2021: ECB, CBC, CFB, OFB, CTR, XTS.
+"""Modes of operation for SM4, GB/T 17964-2021: ECB, CBC, CFB, OFB, CTR, XTS; and GCM in pieces (SP 800-38D).
 
 A mode is an immutable value; it says how, never what with. `Cipher` joins it
 with a key and opens streams; `encrypt` and `decrypt` do the whole in one call.
 CFB is the 128-bit one. XTS lives in its own file.
 
-Not here: modes that authenticate (aead). None of these detects a change;
-new designs want SM4GCM.
+Of these only GCM detects a change. New designs want SM4GCM (aead), which does
+it in one call; CCM is there too.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from dataclasses import dataclass, field
 from typing import Literal, NoReturn, Protocol, TypeAlias
 
 from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding
-from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes
+from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes, require_int
 from smcrypto.sm4.engine import Engine, xor_bytes
 from smcrypto.sm4.xts import Variant, XTSStream, check_variant
 
-__all__ = ["CBC", "CFB", "CTR", "ECB", "OFB", "XTS", "Cipher", "CipherStream", "Mode", "Padding", "decrypt", "encrypt"]
+__all__ = [
+    "CBC", "CFB", "CTR", "ECB", "GCM", "OFB", "XTS", "Cipher", "CipherStream", "Mode", "Padding", "decrypt", "encrypt",
+]  # fmt: skip
 
-Padding: TypeAlias = Literal["pkcs7"] | None
+Padding: TypeAlias = Literal["pkcs7", "iso7816", "zeros"] | None
 
 _PIECE = 1 << 20  # bytes worked on at once: some modes keep several copies of them, and longer is no faster
 
@@ -95,7 +97,30 @@ class XTS:
         object.__setattr__(self, "variant", check_variant(variant))
 
 
-Mode: TypeAlias = ECB | CBC | CFB | OFB | CTR | XTS
+@dataclass(frozen=True, slots=True, init=False)
+class GCM:
+    """Galois/Counter Mode for a message in pieces; the ciphertext ends with the tag, as `SM4GCM` has it.
+
+    nonce: 1 byte or more, 12 are usual, never used twice with one key. associated_data: authenticated, not
+    contained. tag_length: 12 to 16. InvalidLength otherwise.
+    """
+
+    nonce: bytes
+    associated_data: bytes = b""
+    tag_length: int = 16
+
+    def __init__(self, nonce: BytesLike, associated_data: BytesLike = b"", tag_length: int = 16) -> None:
+        octets = as_bytes(nonce, "nonce")
+        if not octets:
+            raise InvalidLength("nonce must be 1 byte or more")
+        if not 12 <= require_int(tag_length, "tag_length") <= 16:
+            raise InvalidLength(f"tag_length must be 12 to 16 bytes, not {tag_length}")
+        object.__setattr__(self, "nonce", octets)
+        object.__setattr__(self, "associated_data", as_bytes(associated_data, "associated_data"))
+        object.__setattr__(self, "tag_length", tag_length)
+
+
+Mode: TypeAlias = ECB | CBC | CFB | OFB | CTR | XTS | GCM
 
 
 class _Transform(Protocol):
@@ -106,18 +131,66 @@ class _Transform(Protocol):
     def finalize(self) -> bytes: ...
 
 
-class _Blocks:
-    """Streams of whole blocks: keeps an incomplete block back, refuses one at the end."""
+# What a mode does to blocks: (engine, chain, data, whole) -> (image of the data, the chain after its first `whole`
+# bytes). The chain is a block: the IV or the counter at first. Data is whole blocks; of the last, a part may be zeros
+# that stand for what has not come yet, and then `whole` ends before it.
+_Step: TypeAlias = Callable[[Engine, bytes, bytes, int], tuple[bytes, bytes]]
 
-    def __init__(self, process: Callable[[bytes], bytes]) -> None:
-        self._process = process
+
+def _ecb_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    return engine.encrypt(data), chain
+
+
+def _ecb_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    return engine.decrypt(data), chain
+
+
+def _cbc_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    out = engine.cbc_encrypt(chain, data)
+    return out, (chain + out[-16:])[-16:]
+
+
+def _cbc_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    before = chain + data
+    return engine.decrypt(data, before[: len(data)]), before[-16:]
+
+
+def _cfb_encrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    """C_i = P_i ^ D_i with D_i = E(C_(i-1)) = E(P_(i-1) ^ D_(i-1)): D is CBC of C_0, P_1, P_2, ... from zero on."""
+    before = chain + data
+    out = xor_bytes(engine.cbc_encrypt(bytes(16), before[: len(data)]), data)
+    return out, out[whole - 16 : whole] if whole else chain
+
+
+def _cfb_decrypt(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    before = chain + data
+    return engine.encrypt(before[: len(data)], data), before[whole : whole + 16]
+
+
+def _ofb(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    """O_i = E(O_(i-1)): CBC of zeros."""
+    stream = engine.cbc_encrypt(chain, bytes(len(data)))
+    return xor_bytes(data, stream), stream[whole - 16 : whole] if whole else chain
+
+
+def _ctr(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, bytes]:
+    counter = (int.from_bytes(chain, "big") + whole // 16) % (1 << 128)
+    return engine.ctr_xor(chain, data), counter.to_bytes(16, "big")
+
+
+class _WholeBlocks:
+    """ECB and CBC: keeps an incomplete block back, refuses one at the end."""
+
+    def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
+        self._engine, self._step, self._chain = engine, step, chain
         self._pending = b""
 
     def update(self, data: bytes) -> bytes:
         data = self._pending + data
         whole = len(data) & ~15
         self._pending = data[whole:]
-        return self._process(data[:whole])
+        out, self._chain = self._step(self._engine, self._chain, data[:whole], whole)
+        return out
 
     def finalize(self) -> bytes:
         if self._pending:
@@ -125,112 +198,34 @@ class _Blocks:
         return b""
 
 
-class _CBCEncrypt:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
+class _AnyLength:
+    """CFB, OFB and CTR: out = in XOR mask. A block that was begun is done again, whole, once the rest has come."""
 
-    def __call__(self, blocks: bytes) -> bytes:
-        out = self._engine.cbc_encrypt(self._chain, blocks)
-        self._chain = (self._chain + out)[-16:]
-        return out
-
-
-class _CBCDecrypt:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
-
-    def __call__(self, blocks: bytes) -> bytes:
-        chained = self._chain + blocks
-        self._chain = chained[-16:]
-        return self._engine.decrypt(blocks, chained[: len(blocks)])
-
-
-class _KeyStream:
-    """CTR and OFB: XOR with a stream that does not depend on the data; what is left of a block is kept."""
-
-    def __init__(self, stream: Callable[[bytes], bytes]) -> None:
-        self._xor_stream = stream
-        self._left = b""
+    def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
+        self._engine, self._step, self._chain = engine, step, chain
+        self._begun = self._mask = b""  # what came of the block, and the mask for what has not
 
     def update(self, data: bytes) -> bytes:
-        head, data = data[: len(self._left)], data[len(self._left) :]
-        out = xor_bytes(head, self._left[: len(head)])
-        self._left = self._left[len(head) :]
-        if not data:
-            return out
-        masked = self._xor_stream(data + bytes(-len(data) % 16))
-        self._left = masked[len(data) :]  # zeros XOR stream
-        return out + masked[: len(data)] if head else masked[: len(data)]
-
-    def finalize(self) -> bytes:
-        return b""
-
-
-class _CTR:
-    def __init__(self, engine: Engine, nonce: bytes) -> None:
-        self._engine, self._counter = engine, int.from_bytes(nonce)
-
-    def __call__(self, data: bytes) -> bytes:
-        first = self._counter.to_bytes(16)
-        self._counter = (self._counter + len(data) // 16) % (1 << 128)
-        return self._engine.ctr_xor(first, data)
-
-
-class _OFB:
-    def __init__(self, engine: Engine, iv: bytes) -> None:
-        self._engine, self._chain = engine, iv
-
-    def __call__(self, data: bytes) -> bytes:
-        stream = self._engine.cfb_encrypt(self._chain, bytes(len(data)))
-        self._chain = stream[-16:]
-        return xor_bytes(data, stream)
-
-
-class _CFB:
-    """CFB-128. The chain is the ciphertext block before; of a block under way, what has come of it.
-
-    A block under way is masked with what is left of E(the block before).
-    """
-
-    def __init__(self, engine: Engine, iv: bytes, *, encrypting: bool) -> None:
-        self._engine, self._encrypting = engine, encrypting
-        self._chain, self._mask = iv, b""
-
-    def update(self, data: bytes) -> bytes:
-        out = self._within_block(data[: len(self._mask)])
-        data = data[len(out) :]
+        begun = len(self._begun)
+        if begun and len(data) < len(self._mask):
+            mask, self._mask = self._mask[: len(data)], self._mask[len(data) :]
+            self._begun += data
+            return xor_bytes(data, mask)
+        data = self._begun + data
         whole = len(data) & ~15
-        if whole:
-            out += self._blocks(data[:whole])
-        if whole < len(data):
-            self._mask, self._chain = self._engine.encrypt(self._chain), b""
-            out += self._within_block(data[whole:])
-        return out
-
-    def _within_block(self, piece: bytes) -> bytes:
-        out = xor_bytes(piece, self._mask[: len(piece)])
-        self._mask = self._mask[len(piece) :]
-        self._chain += out if self._encrypting else piece
-        return out
-
-    def _blocks(self, blocks: bytes) -> bytes:
-        if self._encrypting:
-            out = self._engine.cfb_encrypt(self._chain, blocks)
-            self._chain = out[-16:]
-            return out
-        chained = self._chain + blocks
-        self._chain = chained[-16:]
-        return self._engine.encrypt(chained[: len(blocks)], blocks)
+        out, self._chain = self._step(self._engine, self._chain, data + bytes(-len(data) % 16), whole)
+        self._begun, self._mask = data[whole:], out[len(data) :]
+        return out[begun : len(data)]
 
     def finalize(self) -> bytes:
         return b""
 
 
 class _Pad:
-    """PKCS#7 in front of a block mode, RFC 5652 6.3: 1 to 16 bytes, each saying how many."""
+    """Padding in front of a block mode."""
 
-    def __init__(self, inner: _Transform) -> None:
-        self._inner, self._length = inner, 0
+    def __init__(self, inner: _Transform, padding: str) -> None:
+        self._inner, self._padding, self._length = inner, padding, 0
 
     def update(self, data: bytes) -> bytes:
         self._length += len(data)
@@ -238,14 +233,21 @@ class _Pad:
 
     def finalize(self) -> bytes:
         count = 16 - self._length % 16
-        return self._inner.update(bytes([count]) * count) + self._inner.finalize()
+        match self._padding:
+            case "pkcs7":  # RFC 5652, 6.3: 1 to 16 bytes, each saying how many
+                ending = bytes([count]) * count
+            case "iso7816":  # ISO/IEC 7816-4; method 2 of GB/T 15852.1
+                ending = b"\x80" + bytes(count - 1)
+            case _:  # as few zeros as fill the block, none where it is full
+                ending = bytes(count % 16)
+        return self._inner.update(ending) + self._inner.finalize()
 
 
 class _Unpad:
     """The inverse of `_Pad`: holds the last block back until the end is known."""
 
-    def __init__(self, inner: _Transform) -> None:
-        self._inner, self._length, self._held = inner, 0, b""
+    def __init__(self, inner: _Transform, padding: str) -> None:
+        self._inner, self._padding, self._length, self._held = inner, padding, 0, b""
 
     def update(self, data: bytes) -> bytes:
         self._length += len(data)
@@ -255,9 +257,11 @@ class _Unpad:
         return plain[:ready]
 
     def finalize(self) -> bytes:
-        if self._length == 0 or self._length % 16:
+        if self._length % 16 or (self._length == 0 and self._padding != "zeros"):
             raise InvalidPadding("the padding is malformed")
-        return remove_pkcs7(self._held)
+        if self._padding == "zeros":
+            return self._held.rstrip(b"\0")
+        return remove_pkcs7(self._held) if self._padding == "pkcs7" else remove_iso7816(self._held)
 
 
 def remove_pkcs7(block: bytes) -> bytes:
@@ -270,6 +274,18 @@ def remove_pkcs7(block: bytes) -> bytes:
     if wrong:
         raise InvalidPadding("the padding is malformed")
     return block[: 16 - count]
+
+
+def remove_iso7816(block: bytes) -> bytes:
+    """The last block before 80 and zeros, or InvalidPadding; looks at all 16 bytes whatever it finds."""
+    length, searching = 0, 1
+    for i in range(15, -1, -1):
+        marker = searching & int(block[i] == 0x80)
+        length |= marker * (i + 1)
+        searching &= int(block[i] == 0)
+    if not length:
+        raise InvalidPadding("the padding is malformed")
+    return block[: length - 1]
 
 
 class CipherStream:
@@ -309,7 +325,8 @@ class Cipher:
     """A key joined with a mode, GB/T 17964-2021.
 
     key: 16 bytes, for XTS 32; otherwise InvalidKey.
-    padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+    padding: None, or with ECB and CBC "pkcs7", "iso7816" (80 and zeros) or "zeros"; anything else is InvalidOption.
+    "zeros" is for what exists: data that ends in zeros comes back shorter, and nothing is ever malformed.
 
     >>> stream = Cipher(bytes(16), CTR(bytes(16))).encryptor()
     >>> ciphertext = stream.update(b"any num") + stream.update(b"ber of bytes") + stream.finalize()
@@ -325,8 +342,8 @@ class Cipher:
         key = as_bytes(key, "key")
         if not isinstance(mode, Mode):
             raise TypeError(f"mode must be a mode of sm4, not {type(mode).__name__}")
-        if padding not in (None, "pkcs7"):
-            raise InvalidOption('padding must be None or "pkcs7"')
+        if padding not in (None, "pkcs7", "iso7816", "zeros"):
+            raise InvalidOption('padding must be None, "pkcs7", "iso7816" or "zeros"')
         if padding and not isinstance(mode, ECB | CBC):
             raise InvalidOption(f"{type(mode).__name__} takes no padding")
         length = 32 if isinstance(mode, XTS) else 16
@@ -340,29 +357,42 @@ class Cipher:
         """A new stream that encrypts."""
         return CipherStream(_transform(self, encrypting=True))
 
-    def decryptor(self) -> CipherStream:
-        """A new stream that decrypts."""
-        return CipherStream(_transform(self, encrypting=False))
+    def decryptor(self, *, release_unverified: bool = False) -> CipherStream:
+        """A new stream that decrypts.
+
+        Of GCM, `update` returns nothing and `finalize` everything, once the tag, the last bytes of the data, was found
+        right; else InvalidTag. With release_unverified `update` returns plaintext that NOTHING HAS CHECKED YET: whoever
+        uses it before `finalize` has returned acts on what an attacker may have written. For other modes, which
+        never check, it is InvalidOption.
+        """
+        if release_unverified and not isinstance(self.mode, GCM):
+            raise InvalidOption("release_unverified is for GCM: no other mode verifies anything")
+        return CipherStream(_transform(self, encrypting=False, early=release_unverified))
 
 
-def _transform(cipher: Cipher, *, encrypting: bool) -> _Transform:
+def _transform(cipher: Cipher, *, encrypting: bool, early: bool = False) -> _Transform:
     mode = cipher.mode
+    if isinstance(mode, GCM):
+        from smcrypto.sm4.gcmstream import GCMDecryption, GCMEncryption
+
+        what = cipher.key, mode.nonce, mode.associated_data, mode.tag_length
+        return GCMEncryption(*what) if encrypting else GCMDecryption(*what, early=early)
     if isinstance(mode, XTS):
         return XTSStream(cipher.key, mode.tweak, mode.variant, encrypting=encrypting)
     engine = Engine(cipher.key)
     if isinstance(mode, CTR):
-        return _KeyStream(_CTR(engine, mode.nonce))
+        return _AnyLength(engine, _ctr, mode.nonce)
     if isinstance(mode, OFB):
-        return _KeyStream(_OFB(engine, mode.iv))
+        return _AnyLength(engine, _ofb, mode.iv)
     if isinstance(mode, CFB):
-        return _CFB(engine, mode.iv, encrypting=encrypting)
+        return _AnyLength(engine, _cfb_encrypt if encrypting else _cfb_decrypt, mode.iv)
     if isinstance(mode, ECB):
-        inner = _Blocks(engine.encrypt if encrypting else engine.decrypt)
+        inner = _WholeBlocks(engine, _ecb_encrypt if encrypting else _ecb_decrypt, b"")
     else:
-        inner = _Blocks(_CBCEncrypt(engine, mode.iv) if encrypting else _CBCDecrypt(engine, mode.iv))
+        inner = _WholeBlocks(engine, _cbc_encrypt if encrypting else _cbc_decrypt, mode.iv)
     if cipher.padding is None:
         return inner
-    return _Pad(inner) if encrypting else _Unpad(inner)
+    return _Pad(inner, cipher.padding) if encrypting else _Unpad(inner, cipher.padding)
 
 
 def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = None) -> bytes:
@@ -371,7 +401,7 @@ def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = N
     key: 16 bytes, for XTS 32; otherwise InvalidKey.
     data: whole blocks for ECB and CBC without padding, 16 bytes or more for
     XTS, otherwise InvalidLength; any length for CFB, OFB, CTR, and with padding.
-    padding: None, or "pkcs7" with ECB and CBC; anything else is InvalidOption.
+    padding: None, or "pkcs7", "iso7816", "zeros" with ECB and CBC; anything else is InvalidOption.
 
     >>> import secrets
     >>> key, iv = secrets.token_bytes(16), secrets.token_bytes(16)
@@ -386,7 +416,7 @@ def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = N
 def decrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = None) -> bytes:
     """The inverse of `encrypt`, with the same errors.
 
-    With padding="pkcs7", data that is empty, not whole blocks, or does not
+    With padding="pkcs7" or "iso7816", data that is empty, not whole blocks, or does not
     end in well-formed padding is InvalidPadding. Do not tell an attacker
     which decryptions fail: that alone reveals CBC plaintext.
     """

@@ -1,4 +1,4 @@
-"""SM4 one block after the other: the engine of single blocks, CBC, CFB and OFB encryption.
+"""SM4 one block after the other: single blocks and CBC encryption, in Python (see `serial` for who calls it).
 
 A round is one expression over tables that hold T of each byte of a word, or
 of each half of it:
@@ -7,8 +7,8 @@ narrow  4 tables of 256 words; ready in a millisecond
 wide    2 tables of 65,536 words, 5 MB, 4 ms to build; a third faster a block,
         so they pay from about WIDE_BLOCKS blocks on and are built only then
 
-All 32 rounds are unrolled into one function per task, in which words stay
-integers from the first block to the last. The functions are written by
+All 32 rounds are unrolled into one function for a block and one for a chain, in which
+words stay integers from the first block to the last. The functions are written by
 `_source`, below. Tables are indexed by secret data: on a machine shared with an
 attacker who can watch the cache, this engine is not the one to trust.
 """
@@ -22,7 +22,7 @@ from typing import Any, TypeAlias
 
 from smcrypto.sm4.block import CK, FK, SBOX, L, L_prime
 
-__all__ = ["WIDE_BLOCKS", "cbc_encrypt", "cfb_encrypt", "crypt_block", "expand_key"]
+__all__ = ["WIDE_BLOCKS", "cbc_encrypt", "crypt_block", "expand_key"]
 
 WIDE_BLOCKS = 2000
 
@@ -31,10 +31,6 @@ Tables: TypeAlias = tuple[list[int], ...]
 # One round, t being X_(i+1) ^ X_(i+2) ^ X_(i+3) ^ rk_i.
 _NARROW = "{x} ^= T0[t >> 24] ^ T1[t >> 16 & 255] ^ T2[t >> 8 & 255] ^ T3[t & 255]"
 _WIDE = "{x} ^= T0[t >> 16] ^ T1[t & 65535]"
-
-# What is done with the words p q r s of the data before and after the rounds on the chain a b c d.
-_BEFORE = {"cbc": "a ^= p; b ^= q; c ^= r; d ^= s", "cfb": "pass"}
-_AFTER = {"cbc": "a, b, c, d = d, c, b, a", "cfb": "a, b, c, d = d ^ p, c ^ q, b ^ r, a ^ s"}
 
 
 def _rounds(one_round: str) -> list[str]:
@@ -51,21 +47,19 @@ def _rounds(one_round: str) -> list[str]:
 
 
 def _source(one_round: str, table_count: int) -> str:
-    """The text of block(), cbc() and cfb() for one kind of table."""
+    """The text of block() and cbc() for one kind of table."""
     unpack_arguments = [
         ", ".join(f"k{i}" for i in range(32)) + " = rk",
         ", ".join(f"T{i}" for i in range(table_count)) + " = tables",
     ]
-    lines = ["def block(tables, rk, data):"]
-    lines += ["    " + line for line in [*unpack_arguments, "a, b, c, d = unpack(data)", *_rounds(one_round)]]
-    lines.append("    return pack(d, c, b, a)")
-    for mode in ("cbc", "cfb"):
-        lines.append(f"def {mode}(tables, rk, chain, words):")
-        lines += ["    " + line for line in [*unpack_arguments, "a, b, c, d = unpack(chain)", "out = []"]]
-        lines.append("    for p, q, r, s in zip(words, words, words, words):")
-        lines += ["        " + line for line in [_BEFORE[mode], *_rounds(one_round), _AFTER[mode]]]
-        lines += ["        out += (a, b, c, d)", "    return out"]
-    return "\n".join(lines)
+    rounds = _rounds(one_round)
+    block = [*unpack_arguments, "a, b, c, d = unpack(data)", *rounds, "return pack(d, c, b, a)"]
+    chain = [*unpack_arguments, "a, b, c, d = unpack(chain)", "out = []"]
+    chain.append("for p, q, r, s in zip(words, words, words, words):")
+    in_loop = ["a ^= p; b ^= q; c ^= r; d ^= s", *rounds, "a, b, c, d = d, c, b, a", "out += (a, b, c, d)"]
+    lines = ["def block(tables, rk, data):", *("    " + line for line in block)]
+    lines += ["def cbc(tables, rk, chain, words):", *("    " + line for line in chain)]
+    return "\n".join([*lines, *("        " + line for line in in_loop), "    return out"])
 
 
 def _compile(one_round: str, table_count: int) -> dict[str, Callable[..., Any]]:
@@ -118,18 +112,9 @@ def crypt_block(rk: Sequence[int], block: bytes, blocks: int = 1) -> bytes:
     return result
 
 
-def _chained(mode: str, rk: Sequence[int], chain: bytes, data: bytes) -> bytes:
+def cbc_encrypt(rk: Sequence[int], chain: bytes, data: bytes) -> bytes:
+    """C_i = E(P_i ^ C_(i-1)) over whole blocks, C_0 being `chain`."""
     functions, tables = _wide() if len(data) >= 16 * WIDE_BLOCKS else _narrow()
     count = len(data) // 4
     words = iter(struct.unpack(f">{count}I", data))
-    return struct.pack(f">{count}I", *functions[mode](tables, rk, chain, words))
-
-
-def cbc_encrypt(rk: Sequence[int], chain: bytes, data: bytes) -> bytes:
-    """C_i = E(P_i ^ C_(i-1)) over whole blocks, C_0 being `chain`."""
-    return _chained("cbc", rk, chain, data)
-
-
-def cfb_encrypt(rk: Sequence[int], chain: bytes, data: bytes) -> bytes:
-    """C_i = P_i ^ E(C_(i-1)) over whole blocks, C_0 being `chain`. On zeros this is OFB's key stream."""
-    return _chained("cfb", rk, chain, data)
+    return struct.pack(f">{count}I", *functions["cbc"](tables, rk, chain, words))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from typing import Final, NamedTuple
 
 from smcrypto import der, pem, sm2
@@ -102,8 +102,8 @@ def instant(value: datetime, name: str) -> datetime:
     if not isinstance(value, datetime):
         raise TypeError(f"{name} must be a datetime, not {type(value).__name__}")
     if value.utcoffset() is None:
-        raise InvalidOption(f"{name} must be an aware datetime, such as datetime.now(UTC)")
+        raise InvalidOption(f"{name} must be an aware datetime, such as datetime.now(timezone.utc)")
     try:
-        return value.astimezone(UTC)
+        return value.astimezone(timezone.utc)
     except OverflowError:
         raise InvalidOption(f"{name} is not within the years 1 to 9999 of UTC") from None

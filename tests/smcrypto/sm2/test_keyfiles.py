@@ -659,3 +659,34 @@ def test_a_key_written_for_older_openssl_is_read_by_it(require: Callable[[str], 
         key.to_pem(b"open sesame", prf="md5")
     with pytest.raises(InvalidOption):
         key.to_pem(prf="md5")
+
+
+# --- Python without OpenSSL, where hashlib has neither PBKDF2 nor scrypt ---
+
+
+@pytest.mark.parametrize("prf", ["sm3", "sha256"])
+def test_keys_are_encrypted_and_read_without_openssl(prf: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    written_with = KEY.to_pem(b"password", prf=prf)
+    monkeypatch.delattr(hashlib, "pbkdf2_hmac")
+    monkeypatch.setattr(sm3, "ENGINE", "python")
+    monkeypatch.setattr(keyfiles, "ITERATIONS", 100)
+    if prf == "sha256":
+        assert sm2.PrivateKey.from_pem(written_with, b"password") == KEY
+        assert sm2.PrivateKey.from_pem(KEY.to_pem(b"password", prf=prf), b"password") == KEY
+    else:
+        sealed = keyfiles.dump_private(KEY.to_int(), POINT, b"password", "pkcs8", form="pem", prf=prf, iterations=10)
+        assert sm2.PrivateKey.from_pem(sealed, b"password") == KEY
+
+
+@pytest.mark.parametrize("length", [1, 16, 20, 33, 64])
+@pytest.mark.parametrize("name", ["sha1", "sha256", "sha512"])
+def test_our_pbkdf2_is_hashlibs(name: str, length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = hashlib.pbkdf2_hmac(name, b"a password", b"salt", 3, length)
+    monkeypatch.delattr(hashlib, "pbkdf2_hmac")
+    assert keyfiles._pbkdf2(name, b"a password", b"salt", 3, length) == expected
+
+
+def test_without_openssl_scrypt_is_a_missing_dependency(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(hashlib, "scrypt")
+    with pytest.raises(MissingDependency, match="OpenSSL"):
+        sm2.PrivateKey.from_der(encrypted(derivation=scrypt(16, 8, 1)), b"pw")

@@ -15,6 +15,8 @@ from smcrypto.sm4.ghash import ghash_by_definition
 from vectors_json import load
 
 KEY = bytes.fromhex("0123456789abcdeffedcba9876543210")
+
+pytestmark = pytest.mark.usefixtures("sm4_engine")
 NONCE = b"twelve bytes"
 TEXT = random.Random(6).randbytes(777)
 

@@ -13,6 +13,8 @@ from smcrypto import sm4
 from smcrypto.sm4 import block, tables
 from vectors_json import load
 
+pytestmark = pytest.mark.usefixtures("sm4_engine")
+
 # GB/T 32907-2016, 6.2 a), two rows of the table to a line.
 STANDARD_SBOX = bytes.fromhex("""
     d690e9fecce13db716b614c228fb2c05 2b679a762abe04c3aa44132649860699

@@ -21,6 +21,7 @@ from vectors_json import load
 KEY = bytes.fromhex("0123456789abcdeffedcba9876543210")
 IV = bytes(range(16))
 RANDOM = random.Random(17964)
+pytestmark = pytest.mark.usefixtures("sm4_engine")
 
 MODES: dict[str, Callable[[bytes], sm4.Mode]] = {
     "ECB": lambda iv: sm4.ECB(),

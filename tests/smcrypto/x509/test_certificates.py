@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +18,8 @@ from smcrypto import CertificateError, InvalidKey, InvalidLength, InvalidOption,
 from smcrypto.x509 import Certificate, CertificateSigningRequest, Extension, Name
 from vectors_json import load
 from x509_authority import BEGIN, END, NOW, Holder, root
+
+UTC = timezone.utc
 
 ROOT = root("root")
 KEY = sm2.PrivateKey.generate()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from smcrypto import CertificateError, InvalidKey, InvalidOption, SMCryptoError, der, x509
 from smcrypto.x509 import CertificateRevocationList, CertificateRevokedError, RevokedCertificate
 from x509_authority import BEGIN, NOW, Holder, certificates, root
+
+UTC = timezone.utc
 
 ROOT = root()
 SUB = ROOT.ca("sub")

@@ -1,4 +1,4 @@
-"""`python -m smcrypto.bench`: the comparison with other implementations, as Markdown and as a picture.
+"""`python benchmarks/render.py`: the comparison with other implementations, as Markdown and as a picture.
 
 Reads the JSON that `pytest benchmarks/` wrote. Every ratio is taken between
 implementations measured in that one run on that one machine; nothing is
@@ -138,7 +138,7 @@ def picture(report: dict[str, Any], path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m smcrypto.bench",
+        prog="python benchmarks/render.py",
         description="Render the results of `pytest benchmarks/` as Markdown and as a picture.",
     )
     parser.add_argument("results", nargs="?", type=Path, default=Path("benchmarks/results.json"),
@@ -160,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             print(table, end="")
     except (OSError, MissingDependency) as error:
-        print(f"smcrypto.bench: {error}", file=sys.stderr)
+        print(f"render: {error}", file=sys.stderr)
         return 1
     return 0
 

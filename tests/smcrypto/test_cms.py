@@ -1,0 +1,345 @@
+"""GB/T 35275 messages and SM2EnvelopedKey: another implementation's, our own both ways, and what is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import smcrypto
+from smcrypto import (
+    CertificateError,
+    InvalidCiphertext,
+    InvalidEncoding,
+    InvalidKey,
+    InvalidOption,
+    InvalidSignature,
+    SMCryptoError,
+    cms,
+    der,
+    pem,
+    sm2,
+    sm3,
+    x509,
+)
+
+NOW = datetime(2026, 6, 1, tzinfo=timezone.utc)
+PEER = SimpleNamespace(**{
+    name: value if name in ("source", "verified_with") else bytes.fromhex(value)
+    for name, value in json.loads(
+        (Path(__file__).parents[1] / "vectors/peers/cms_gmsm/messages.json").read_text("utf-8")).items()
+})  # fmt: skip
+CONTENT = PEER.content
+KEY = sm2.PrivateKey.from_bytes(PEER.key)
+CERTIFICATE = x509.Certificate.from_der(PEER.certificate)
+ROOT_KEY = sm2.PrivateKey.from_int(0x13579)
+ROOT = x509.self_signed(ROOT_KEY, subject={"CN": "root"}, not_before=NOW, not_after=NOW + timedelta(99))
+OTHER = sm2.PrivateKey.from_int(0x2468)
+
+
+def issued(key: sm2.PrivateKey, **options: Any) -> x509.Certificate:
+    request = x509.CertificateSigningRequest.create(key, subject={"CN": "employee"})
+    return x509.issue(request, ROOT, ROOT_KEY, not_before=NOW, not_after=NOW + timedelta(9), **options)
+
+
+SIGNING = issued(OTHER)
+SEALING = issued(OTHER, key_usage=x509.ENCRYPTION_KEY_USAGE)
+FREE = issued(OTHER, key_usage=())
+TRUST: dict[str, Any] = {"roots": [ROOT], "at": NOW}
+
+
+# --- what another implementation wrote ---
+
+
+@pytest.mark.parametrize("name", ["signed", "signed_attributes"])
+@pytest.mark.parametrize("detached", [False, True])
+def test_signed_messages_of_the_peer(name: str, detached: bool) -> None:
+    data = getattr(PEER, f"{name}_detached={str(detached).lower()}")
+    found = cms.verify(data, roots=[CERTIFICATE], at=NOW, content=CONTENT if detached else None)
+    assert (found.content, found.signers) == (CONTENT, (CERTIFICATE,))
+    assert (found.times[0] is not None) == (name == "signed_attributes")
+
+
+def test_enveloped_messages_of_the_peer() -> None:
+    assert cms.decrypt(PEER.enveloped, KEY, CERTIFICATE) == CONTENT
+    found = cms.decrypt_and_verify(PEER.signed_and_enveloped, KEY, CERTIFICATE, roots=[CERTIFICATE], at=NOW)
+    assert (found.content, found.signers) == (CONTENT, (CERTIFICATE,))
+    assert sm2.PrivateKey.from_enveloped(PEER.enveloped_key, KEY).to_bytes() == PEER.enveloped_key_d
+
+
+# --- our own ---
+
+
+@pytest.mark.parametrize("uid", [sm2.DEFAULT_UID, b"", b"bank"])
+@pytest.mark.parametrize("time", [None, NOW])
+@pytest.mark.parametrize("detached", [False, True])
+@pytest.mark.parametrize("content", [b"", b"pay 10", bytes(5000)])
+def test_signed(content: bytes, detached: bool, time: datetime | None, uid: bytes) -> None:
+    key = sm2.PrivateKey.from_int(0x555)
+    certificate = x509.self_signed(key, subject={"CN": "x"}, not_before=NOW, not_after=NOW + timedelta(9),
+                                   key_usage=("nonRepudiation",))  # fmt: skip
+    data = cms.sign(content, key, certificate, detached=detached, signing_time=time, uid=uid)
+    assert der.check(data) == data
+    given_content = content if detached else None
+    found = cms.verify(data, roots=None, at=NOW, content=given_content, uid=uid)
+    assert found == (content, (certificate,), (time,))
+    armoured = pem.encode("PKCS7", data)
+    assert cms.verify(armoured, roots=None, at=NOW, content=given_content, uid=uid) == found
+    with pytest.raises(InvalidSignature):
+        cms.verify(data, roots=None, at=NOW, content=given_content, uid=b"another")
+    if detached:
+        with pytest.raises(InvalidSignature):
+            cms.verify(data, roots=None, at=NOW, content=content + b"!", uid=uid)
+
+
+def test_a_signer_must_be_trusted() -> None:
+    data = cms.sign(CONTENT, OTHER, SIGNING)
+    assert cms.verify(data, **TRUST).signers == (SIGNING,)
+    with pytest.raises(CertificateError):
+        cms.verify(data, roots=[CERTIFICATE], at=NOW)
+    with pytest.raises(CertificateError):
+        cms.verify(data, roots=[ROOT], at=NOW + timedelta(100))
+    with pytest.raises(CertificateError, match="may not sign"):
+        cms.verify(cms.sign(CONTENT, OTHER, SEALING), **TRUST)
+    assert cms.verify(cms.sign(CONTENT, OTHER, FREE), **TRUST)
+    revoked = x509.CertificateRevocationList.create(
+        ROOT, ROOT_KEY, revoked=[x509.RevokedCertificate(SIGNING.serial_number, NOW)], this_update=NOW,
+        next_update=NOW + timedelta(1), number=1)  # fmt: skip
+    with pytest.raises(x509.CertificateRevokedError):
+        cms.verify(data, **TRUST, crls=[revoked])
+
+
+def test_issuers_and_revocation_lists_inside_are_used() -> None:
+    middle_key = sm2.PrivateKey.from_int(0x777)
+    request = x509.CertificateSigningRequest.create(middle_key, subject={"CN": "middle"})
+    middle = x509.issue(request, ROOT, ROOT_KEY, not_before=NOW, not_after=NOW + timedelta(9), ca=True)
+    leaf = x509.issue(x509.CertificateSigningRequest.create(OTHER, subject={"CN": "leaf"}), middle, middle_key,
+                      not_before=NOW, not_after=NOW + timedelta(9))  # fmt: skip
+    assert cms.verify(cms.sign(b"m", OTHER, leaf, certificates=[middle, leaf]), **TRUST).signers == (leaf,)
+    with pytest.raises(CertificateError):
+        cms.verify(cms.sign(b"m", OTHER, leaf), **TRUST)
+    assert cms.verify(cms.sign(b"m", OTHER, leaf), **TRUST, intermediates=[middle])
+    crl = x509.CertificateRevocationList.create(middle, middle_key, revoked=[x509.RevokedCertificate(
+        leaf.serial_number, NOW)], this_update=NOW, next_update=NOW + timedelta(1), number=1)  # fmt: skip
+    body = parts(cms.sign(b"m", OTHER, leaf, certificates=[middle]))
+    body.insert(4, der.explicit(1, crl.to_der()))
+    with pytest.raises(x509.CertificateRevokedError):
+        cms.verify(message(2, body), **TRUST)
+
+
+@pytest.mark.parametrize("content", [b"", b"pay 10", bytes(5000)])
+def test_enveloped(content: bytes) -> None:
+    for data in (cms.encrypt(content, [CERTIFICATE, SEALING, FREE]), ):
+        assert der.check(data) == data
+        for key, certificate in ((KEY, CERTIFICATE), (OTHER, SEALING), (OTHER, FREE)):
+            assert cms.decrypt(data, key, certificate) == content
+        assert cms.decrypt(pem.encode("CMS", data), KEY, CERTIFICATE) == content
+        with pytest.raises(CertificateError, match="not for"):
+            cms.decrypt(data, ROOT_KEY, ROOT)
+        with pytest.raises(InvalidKey):
+            cms.decrypt(data, OTHER, CERTIFICATE)
+    data = cms.sign_and_encrypt(content, OTHER, SIGNING, [SEALING])
+    assert cms.decrypt_and_verify(data, OTHER, SEALING, **TRUST) == (content, (SIGNING,), (None,))
+    with pytest.raises(InvalidSignature):
+        cms.decrypt_and_verify(data, OTHER, SEALING, **TRUST, uid=b"another")
+    with pytest.raises(CertificateError):
+        cms.decrypt_and_verify(data, OTHER, SEALING, roots=[CERTIFICATE], at=NOW)
+
+
+def test_what_cannot_be_written() -> None:
+    with pytest.raises(InvalidOption):
+        cms.encrypt(b"m", [])
+    with pytest.raises(CertificateError, match="not for encryption"):
+        cms.encrypt(b"m", [SIGNING])
+    with pytest.raises(InvalidKey):
+        cms.sign(b"m", KEY, SIGNING)
+    with pytest.raises(InvalidOption):
+        cms.sign(b"m", OTHER, SIGNING, signing_time=NOW.replace(tzinfo=None))
+    wrong: list[Callable[[], Any]] = [
+        lambda: cms.sign("m", OTHER, SIGNING),
+        lambda: cms.sign(b"m", b"key", SIGNING),
+        lambda: cms.sign(b"m", OTHER, b"certificate"),
+        lambda: cms.sign(b"m", OTHER, SIGNING, certificates=[b""]),
+        lambda: cms.encrypt(b"m", [b""]),
+        lambda: cms.decrypt(b"", b"", SIGNING),
+        lambda: cms.decrypt(PEER.enveloped, KEY, b""),
+        lambda: cms.verify("", **TRUST),
+        lambda: OTHER.to_enveloped(b""),
+        lambda: sm2.PrivateKey.from_enveloped(b"", b""),
+    ]
+    for call in wrong:
+        with pytest.raises((TypeError, InvalidEncoding)):
+            call()
+
+
+# --- what is refused ---
+
+
+def parts(data: bytes) -> list[bytes]:
+    """The members of the body of a message."""
+    outer = der.Reader(data).sequence()
+    outer.oid()
+    body = outer.explicit(0).sequence()
+    members = []
+    while not body.at_end():
+        members.append(body.raw())
+    return members
+
+
+def message(kind: int, members: list[bytes], arc: str = "1.2.156.10197.6.1.4.2") -> bytes:
+    return der.sequence(der.oid(f"{arc}.{kind}"), der.explicit(0, der.sequence(*members)))
+
+
+def attribute(kind: str, *values: bytes) -> bytes:
+    return der.sequence(der.oid(kind), der.set_of(*values))
+
+
+TYPE = attribute("1.2.840.113549.1.9.3", der.oid("1.2.156.10197.6.1.4.2.1"))
+DIGEST = attribute("1.2.840.113549.1.9.4", der.octet_string(sm3.digest(CONTENT)))
+SM3 = der.sequence(der.oid("1.2.156.10197.1.401"))
+SIGN = der.sequence(der.oid("1.2.156.10197.1.501"))
+
+
+def signed_with(attributes: list[bytes], *, sort: bool = True, after: bytes = b"", signature: bytes = SIGN,
+                digest: bytes = SM3, version: int = 1) -> bytes:  # fmt: skip
+    """SignedData of CONTENT whose one signer signed these attributes."""
+    ordered = sorted(attributes) if sort else attributes
+    info = der.sequence(
+        der.integer(version), der.sequence(SIGNING.issuer.to_der(), der.integer(SIGNING.serial_number)), digest,
+        der.explicit(0, *ordered), signature, der.octet_string(OTHER.sign(der.set_of(*attributes))), after)  # fmt: skip
+    members = parts(cms.sign(CONTENT, OTHER, SIGNING))
+    return message(2, [*members[:-1], der.element(der.SET, info)])
+
+
+def test_attributes_are_required_and_compared() -> None:
+    assert cms.verify(signed_with([TYPE, DIGEST]), **TRUST).content == CONTENT
+    extra = attribute("1.2.3", der.integer(1), der.integer(2))
+    assert cms.verify(signed_with([TYPE, DIGEST, extra], after=der.explicit(1, extra)), **TRUST)
+    pkcs7_type = attribute("1.2.840.113549.1.9.3", der.oid("1.2.840.113549.1.7.1"))
+    assert cms.verify(signed_with([pkcs7_type, DIGEST]), **TRUST)
+    for attributes in ([TYPE], [DIGEST], [TYPE, DIGEST, DIGEST],
+                       [TYPE, attribute("1.2.840.113549.1.9.4", der.octet_string(b"1"), der.octet_string(b"2"))]):
+        with pytest.raises(InvalidEncoding):
+            cms.verify(signed_with(attributes), **TRUST)
+    with pytest.raises(InvalidEncoding):
+        cms.verify(signed_with(sorted([TYPE, DIGEST], reverse=True), sort=False), **TRUST)
+    for attributes in ([attribute("1.2.840.113549.1.9.3", der.oid("1.2.3")), DIGEST],
+                       [TYPE, attribute("1.2.840.113549.1.9.4", der.octet_string(bytes(32)))]):
+        with pytest.raises(InvalidSignature):
+            cms.verify(signed_with(attributes), **TRUST)
+
+
+def test_other_algorithms_and_versions_are_refused() -> None:
+    sha256 = der.sequence(der.oid("2.16.840.1.101.3.4.2.1"))
+    for options in ({"digest": sha256}, {"signature": sha256}, {"version": 3},
+                    {"signature": der.sequence(der.oid("1.2.156.10197.1.501"), der.integer(1))}):  # fmt: skip
+        with pytest.raises(InvalidEncoding):
+            cms.verify(signed_with([TYPE, DIGEST], **options), **TRUST)  # type: ignore[arg-type]
+    members = parts(cms.encrypt(b"m", [FREE]))
+    info = der.Reader(members[2]).sequence()
+    name, cipher, text = info.raw(), info.raw(), info.raw()
+    for altered in (
+        [name, der.sequence(der.oid("1.2.156.10197.1.104.1")), text],
+        [name, der.sequence(der.oid("1.2.156.10197.1.104.2"), der.octet_string(bytes(15))), text],
+        [der.oid("1.2.3"), cipher, text],
+    ):
+        with pytest.raises(InvalidEncoding):
+            cms.decrypt(message(3, [*members[:2], der.sequence(*altered)]), OTHER, FREE)
+
+
+def test_what_is_missing_or_twice() -> None:
+    attached, detached = cms.sign(CONTENT, OTHER, SIGNING), cms.sign(CONTENT, OTHER, SIGNING, detached=True)
+    with pytest.raises(InvalidEncoding, match="given as well"):
+        cms.verify(attached, **TRUST, content=CONTENT)
+    with pytest.raises(InvalidEncoding, match="missing"):
+        cms.verify(detached, **TRUST)
+    members = parts(attached)
+    with pytest.raises(InvalidSignature, match="nobody"):
+        cms.verify(message(2, [*members[:-1], der.set_of()]), **TRUST)
+    with pytest.raises(CertificateError, match="not here"):
+        cms.verify(message(2, [*members[:3], members[4]]), **TRUST)
+    assert cms.verify(message(2, [*members[:3], members[4]]), **TRUST, intermediates=[CERTIFICATE, SIGNING])
+    assert cms.verify(message(2, members, "1.2.840.113549.1.7"), **TRUST).content == CONTENT
+    with pytest.raises(InvalidEncoding, match="kind"):
+        cms.verify(message(3, members), **TRUST)
+    with pytest.raises(InvalidEncoding):
+        cms.decrypt(attached, KEY, CERTIFICATE)
+    for cut in (attached[:-1], attached + b"\0", b"", b"-----BEGIN CMS-----\n-----END CMS-----\n"):
+        with pytest.raises(InvalidEncoding):
+            cms.verify(cut, **TRUST)
+
+
+def test_one_failure_for_key_and_padding() -> None:
+    members = parts(cms.encrypt(b"m", [FREE]))
+    for sealed_key in (CERTIFICATE.public_key.encrypt(bytes(16)), OTHER.public_key.encrypt(bytes(16)),
+                       OTHER.public_key.encrypt(bytes(15)), b""):  # fmt: skip
+        recipient = der.sequence(
+            der.integer(0), der.sequence(FREE.issuer.to_der(), der.integer(FREE.serial_number)),
+            der.sequence(der.oid("1.2.156.10197.1.301.3")), der.octet_string(sealed_key))  # fmt: skip
+        altered = message(3, [members[0], der.element(der.SET, recipient + recipient), members[2]])
+        with pytest.raises(InvalidCiphertext, match="does not open") as raised:
+            cms.decrypt(altered, OTHER, FREE)
+        assert raised.value.__cause__ is None and raised.value.__suppress_context__
+
+
+SAMPLES = [cms.sign(b"m", OTHER, SIGNING, signing_time=NOW), cms.encrypt(b"m", [FREE]),
+           cms.sign_and_encrypt(b"m", OTHER, SIGNING, [FREE]), OTHER.to_enveloped(KEY.public_key)]  # fmt: skip
+
+
+@given(st.sampled_from(SAMPLES), st.data())
+def test_altered_messages_are_refused_or_say_the_same(sample: bytes, draw: st.DataObject) -> None:
+    data = bytearray(sample)
+    position = draw.draw(st.integers(0, len(data) - 1))
+    data[position] ^= draw.draw(st.integers(1, 255))
+    with contextlib.suppress(SMCryptoError):
+        assert cms.verify(bytes(data), **TRUST).content == b"m"
+    with contextlib.suppress(SMCryptoError):
+        assert cms.decrypt_and_verify(bytes(data), OTHER, FREE, **TRUST).content == b"m"
+    with contextlib.suppress(SMCryptoError):
+        cms.decrypt(bytes(data), OTHER, FREE)  # any content: nothing authenticates it
+    with contextlib.suppress(SMCryptoError):
+        assert sm2.PrivateKey.from_enveloped(bytes(data), KEY) == OTHER
+
+
+# --- SM2EnvelopedKey ---
+
+
+def sealed(*, algorithm: bytes | None = None, key: bytes | None = None, point: bytes | None = None,
+           text: bytes | None = None, after: bytes = b"") -> bytes:  # fmt: skip
+    symmetric = bytes(16)
+    return der.sequence(
+        der.sequence(der.oid("1.2.156.10197.1.104.1")) if algorithm is None else algorithm,
+        KEY.public_key.encrypt(symmetric) if key is None else key,
+        der.bit_string(OTHER.public_key.to_bytes() if point is None else point),
+        der.bit_string(smcrypto.sm4.encrypt(symmetric, smcrypto.sm4.ECB(), OTHER.to_bytes()) if text is None else text),
+        after)  # fmt: skip
+
+
+def test_keys_are_sealed_and_opened() -> None:
+    data = OTHER.to_enveloped(KEY.public_key)
+    assert der.check(data) == data and sm2.PrivateKey.from_enveloped(data, KEY) == OTHER
+    assert sm2.PrivateKey.from_enveloped(sealed(), KEY) == OTHER
+    sm4_null = der.sequence(der.oid("1.2.156.10197.1.104"), der.null())
+    assert sm2.PrivateKey.from_enveloped(sealed(algorithm=sm4_null), KEY) == OTHER
+    with pytest.raises(InvalidCiphertext):
+        sm2.PrivateKey.from_enveloped(data, ROOT_KEY)
+
+
+@pytest.mark.parametrize("altered", [
+    {"algorithm": der.sequence(der.oid("1.2.156.10197.1.104.2"))},
+    {"algorithm": der.sequence(der.oid("1.2.156.10197.1.104.1"), der.integer(1))},
+    {"point": ROOT_KEY.public_key.to_bytes()}, {"point": b"\4" + bytes(64)}, {"text": bytes(48)}, {"text": bytes(32)},
+    {"after": der.null()}, {"key": KEY.public_key.encrypt(bytes(15))},
+    {"text": smcrypto.sm4.encrypt(bytes(16), smcrypto.sm4.ECB(), bytes(32))},
+])  # fmt: skip
+def test_what_is_no_sealed_key(altered: dict[str, bytes]) -> None:
+    with pytest.raises(InvalidKey):
+        sm2.PrivateKey.from_enveloped(sealed(**altered), KEY)

@@ -1,0 +1,250 @@
+"""`diagnose`: every form of every thing is recognised, what fits is said, and the calls that it prints do read it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import importlib.util
+import secrets
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import smcrypto
+from smcrypto import InvalidKey, InvalidLength, diagnose, sm2, sm3, x509
+from smcrypto.cli import main
+from smcrypto.diagnosis import MAX_SIZE, key_of
+from smcrypto.sm2.curve import SM2P256V1
+from x509_authority import root
+
+KEY = sm2.PrivateKey.from_int(0x3945208F7B2144B13F36E38AC6D39F95889393692860B51A42FB81EF4DF7C5B8)  # GB/T 32918.5, A.2
+PUBLIC, OTHER = KEY.public_key, sm2.PrivateKey.from_int(0x1234567)
+MESSAGE = b"message digest"
+D, XY = KEY.to_bytes().hex(), PUBLIC.to_bytes()[1:].hex()
+
+WRITTEN = {
+    "bytes": lambda data: data,
+    "hex": lambda data: data.hex(),
+    "HEX with 0x and spaces": lambda data: "0x" + data.hex(" ").upper() + "\n",
+    "base64": lambda data: base64.b64encode(data).decode(),
+    "base64 for addresses": lambda data: base64.urlsafe_b64encode(data).rstrip(b"="),
+    "hex in base64": lambda data: base64.b64encode(data.hex().encode()),
+    "base64 in hex": lambda data: base64.b64encode(data).hex(),
+}
+
+
+def evaluated(call: str, data: Any, **names: Any) -> Any:
+    """The Python that a diagnosis prints, run."""
+    return eval(call.partition("   #")[0], {"sm2": sm2, "x509": x509, "base64": base64, "data": data, **names})
+
+
+def gmssl_names() -> dict[str, Any]:
+    if importlib.util.find_spec("gmssl") is None:
+        pytest.skip("the package gmssl is not installed")
+    from gmssl.sm2 import CryptSM2
+
+    return {"CryptSM2": CryptSM2, "D": D, "XY": XY}
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("form", ["der", "sec1", "raw", "raw after 00"])
+def test_private_keys(form: str, written: str) -> None:
+    octets = {"der": KEY.to_der(), "sec1": KEY.to_der(format="sec1"), "raw": KEY.to_bytes(),
+              "raw after 00": b"\0" + KEY.to_bytes()}[form]  # fmt: skip
+    data = WRITTEN[written](octets)
+    [reading] = diagnose(data, key=PUBLIC).readings
+    assert reading.what == "private key" and reading.verdict == "it is the given key's"
+    assert D not in str(reading), "the secret is not printed"
+    assert diagnose(data, key=OTHER).readings[0].verdict == "it is another key than the one given"
+    if written in ("bytes", "hex", "base64"):
+        assert evaluated(dict(reading.calls)["smcrypto"], data) == KEY
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("form", ["der", "point", "compressed", "bare"])
+def test_public_keys(form: str, written: str) -> None:
+    octets = {"der": PUBLIC.to_der(), "point": PUBLIC.to_bytes(), "compressed": PUBLIC.to_bytes(compressed=True),
+              "bare": PUBLIC.to_bytes()[1:]}[form]  # fmt: skip
+    data = WRITTEN[written](octets)
+    [reading] = diagnose(data, key=KEY).readings
+    assert reading.what == "public key" and reading.verdict == "it belongs to the given key"
+    assert diagnose(data, key=OTHER.public_key).readings[0].verdict == "it is of another key than the one given"
+    assert diagnose(data).readings[0].verdict == ""
+    if written in ("bytes", "hex", "base64"):
+        assert evaluated(dict(reading.calls)["smcrypto"], data) == PUBLIC
+    evaluated(dict(reading.calls)["gmssl"], data, **gmssl_names()).public_key.endswith(XY[-60:])
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("encoding", ["der", "raw"])
+@pytest.mark.parametrize("uid", [sm2.DEFAULT_UID, b"", b"ALICE123@YAHOO.COM"])
+def test_signatures(uid: bytes, encoding: Any, written: str) -> None:
+    data = WRITTEN[written](KEY.sign(MESSAGE, uid=uid, encoding=encoding))
+    [reading] = diagnose(data, key=PUBLIC, message=MESSAGE, uid=b"ALICE123@YAHOO.COM").readings
+    assert reading.what == "signature" and reading.verdict == f"holds for the key, with uid {uid!r}"
+    calls = dict(reading.calls)
+    assert len(calls) == 5 and uid.decode() in calls["openssl"] and uid.decode() in calls["sm-crypto"]
+    if written in ("bytes", "hex", "base64"):
+        evaluated(calls["smcrypto"], data, key=PUBLIC, message=MESSAGE)
+    if uid == sm2.DEFAULT_UID:
+        assert evaluated(calls["gmssl"], data, message=MESSAGE, **gmssl_names())
+    else:
+        assert "fixed" in calls["gmssl"]
+    assert "does not hold" in diagnose(data, key=PUBLIC, message=b"another").readings[0].verdict
+    assert "give the message" in diagnose(data, key=PUBLIC).readings[0].verdict
+    assert diagnose(data).readings[0].verdict == ""
+
+
+@pytest.mark.parametrize("e, story", [
+    (sm3.digest(MESSAGE), "e = SM3 of the message alone"),
+    (hashlib.sha256(MESSAGE).digest(), "e = SHA-256 of the message alone"),
+    (MESSAGE.rjust(32, b"\0"), "the message itself in the hash's place"),
+])  # fmt: skip
+def test_signatures_without_z(e: bytes, story: str) -> None:
+    data = KEY.sign_digest(e, encoding="raw").hex()
+    [reading] = diagnose(data, key=KEY, message=MESSAGE).readings
+    assert story in reading.verdict and "holds" in reading.verdict
+    evaluated(dict(reading.calls)["smcrypto"], data, key=PUBLIC, e=e)
+    assert evaluated(dict(reading.calls)["gmssl"], data, e=e, **gmssl_names())
+
+
+def test_signatures_of_what_was_not_meant() -> None:
+    def verdict(signature: bytes, message: bytes) -> str:
+        return diagnose(signature, key=KEY, message=message).readings[0].verdict
+
+    assert verdict(KEY.sign(b"m"), b"m\r\n").endswith("without its last line end")
+    assert verdict(KEY.sign(b"\x01\xab"), b"01AB").endswith("of the bytes that the message spells in hex")
+    assert verdict(KEY.sign(b"m".hex().encode()), b"m").endswith("of the message's hex digits as text")
+    raw = KEY.sign(b"m", encoding="raw")
+    assert verdict(raw[32:] + raw[:32], b"m").endswith("r and s exchanged")
+    assert "does not hold" in verdict(raw, b"")
+    assert diagnose(bytes(64)).readings == diagnose(b"\xff" * 64).readings == ()
+
+
+@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize("bare", [False, True], ids=["with 04", "without 04"])
+@pytest.mark.parametrize("encoding", ["der", "c1c3c2", "c1c2c3"])
+def test_ciphertexts(encoding: Any, bare: bool, written: str) -> None:
+    octets = PUBLIC.encrypt(MESSAGE, encoding=encoding)
+    data = WRITTEN[written](octets[1:] if bare and encoding != "der" else octets)
+    [reading] = diagnose(data, key=KEY).readings
+    assert reading.what == "ciphertext" and reading.verdict == "opens with the key: 14 bytes"
+    calls = dict(reading.calls)
+    if written in ("bytes", "hex", "base64"):
+        assert evaluated(calls["smcrypto"], data, key=KEY) == MESSAGE
+    assert evaluated(calls["gmssl"].partition("   (")[0], data, **gmssl_names()) == MESSAGE
+    expected = 1 if encoding == "der" else 2
+    assert [r.verdict for r in diagnose(data, key=OTHER).readings] == ["does not open with the key"] * expected
+    # Without the private key, nothing tells the orders apart.
+    assert [r.verdict for r in diagnose(data, key=PUBLIC).readings] == [""] * expected
+
+
+def test_long_ciphertexts_are_not_printed_whole() -> None:
+    report = str(diagnose(PUBLIC.encrypt(bytes(5000))))
+    assert "..." in report and len(report) < 3000
+
+
+def test_pem_and_what_holds_keys() -> None:
+    certificate = root().certificate
+    request = x509.CertificateSigningRequest.create(KEY, subject={"CN": "robot"})
+    holder = certificate.public_key
+    for data, what, key in ((KEY.to_pem(), "private key", KEY), (PUBLIC.to_pem(), "public key", KEY),
+                            (certificate.to_pem(), "certificate", holder),
+                            (certificate.to_der(), "certificate", holder),
+                            (request.to_pem(), "certificate signing request", KEY)):  # fmt: skip
+        [reading] = diagnose(data, key=key).readings
+        assert reading.what == what and reading.verdict in (
+            "it is the given key's", "it belongs to the given key", "it holds the given key")  # fmt: skip
+        assert evaluated(dict(reading.calls)["smcrypto"], data)
+    assert diagnose(certificate.to_der(), key=KEY).readings[0].verdict == "it holds another key than the one given"
+    assert diagnose(root().crl().to_pem(), key=KEY).readings[0].what == "revocation list"
+    both = diagnose(KEY.to_pem() + b"and\n" + PUBLIC.to_pem())
+    assert [reading.what for reading in both.readings] == ["private key", "public key"]
+
+
+def test_encrypted_keys() -> None:
+    sealed = KEY.to_pem(b"password", prf="sha256")
+    assert "a password is needed" in str(diagnose(sealed)) and diagnose(sealed).readings == ()
+    assert diagnose(sealed, password=b"password", key=KEY).readings[0].verdict == "it is the given key's"
+    assert "the password is wrong" in diagnose(sealed, password=b"pass").remarks[0]
+    call = dict(diagnose(sealed, password=b"password").readings[0].calls)["smcrypto"]
+    assert evaluated(call, sealed, password=b"password") == KEY
+
+
+def test_what_needs_another_package_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*arguments: object) -> None:
+        raise smcrypto.MissingDependency("needs the package 'cryptography'")
+
+    monkeypatch.setattr(sm2.PrivateKey, "from_der", missing)
+    assert diagnose(KEY.to_der()).remarks == ("needs the package 'cryptography'",)
+
+
+def test_what_is_nearly_something_has_a_remark() -> None:
+    assert "31 hex digits" not in str(diagnose("0" * 32))
+    assert "odd number" in diagnose(D[:-1]).remarks[0]
+    assert "END line" in diagnose(KEY.to_pem()[:-10]).remarks[0]
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    foreign = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        serialization.Encoding.DER, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())  # fmt: skip
+    assert "curve" in diagnose(foreign).remarks[0]
+    assert diagnose("0" * 32).readings[0].what == "16 bytes" and diagnose(bytes(16)).readings == ()
+    assert str(diagnose("?")) == "nothing of SM2 that is known here"
+    assert diagnose(b"\xff" * 32).readings == () == diagnose(SM2P256V1.n.to_bytes(32, "big")).readings
+    assert diagnose(b"\x30\x00").readings == diagnose(b"").readings == ()
+
+
+def test_arguments() -> None:
+    with pytest.raises(InvalidLength):
+        diagnose(bytes(MAX_SIZE + 1))
+    with pytest.raises(TypeError, match="key must be"):
+        diagnose(b"", key=b"")  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        diagnose(5)  # type: ignore[arg-type]
+
+
+@given(st.binary(max_size=300) | st.text(max_size=300))
+def test_nothing_else_is_raised(data: bytes | str) -> None:
+    diagnose(data, key=KEY, message=b"m", password=b"p")
+
+
+def test_keys_in_any_form_are_found() -> None:
+    for data in (D.encode(), KEY.to_pem(), KEY.to_bytes(), KEY.to_der()):
+        assert key_of(data) == KEY
+    assert key_of(KEY.to_pem(b"pw", prf="sha256"), b"pw") == KEY
+    assert key_of(XY.encode()) == PUBLIC == key_of(PUBLIC.to_pem())
+    for data in (b"", b"abc", KEY.to_pem(b"pw", prf="sha256")):
+        with pytest.raises(InvalidKey):
+            key_of(data)
+
+
+def test_refusals_point_to_it() -> None:
+    with pytest.raises(smcrypto.InvalidSignature, match=r"smcrypto\.diagnose"):
+        PUBLIC.verify(b"", b"")
+    with pytest.raises(smcrypto.InvalidCiphertext, match=r"smcrypto\.diagnose"):
+        KEY.decrypt(b"")
+
+
+def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "key").write_text(D)
+    (tmp_path / "message").write_bytes(MESSAGE)
+    (tmp_path / "signature").write_text(KEY.sign(MESSAGE, uid=b"me").hex())
+    (tmp_path / "password").write_text("password")
+    (tmp_path / "sealed").write_bytes(KEY.to_pem(b"password", prf="sha256"))
+    at = str(tmp_path)
+    assert main(["diagnose", "--key", f"{at}/key", "--message", f"{at}/message", "--uid", "me", f"{at}/signature"]) == 0
+    assert "holds for the key, with uid b'me'" in capsys.readouterr().out
+    assert main(["diagnose", "--password-file", f"{at}/password", f"{at}/sealed"]) == 0
+    assert "private key: DER, encrypted" in capsys.readouterr().out
+    assert main(["diagnose", f"{at}/message"]) == 1
+    assert "nothing of SM2" in capsys.readouterr().err
+
+
+def test_a_points_64_bytes_are_no_signature() -> None:
+    for _ in range(20):
+        point = sm2.PrivateKey(secrets.randbelow(1000) + 1).public_key.to_bytes()[1:]
+        assert [reading.what for reading in diagnose(point).readings] == ["public key"]
