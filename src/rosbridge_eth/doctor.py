@@ -175,7 +175,8 @@ def monitor(address: Address | None, runs: bool) -> Findings:
     elif conditions or not (taken or runs):
         yield ok("monitor", f"{address} " + ("says ready" if conditions else "is free"))
     else:
-        yield broken("monitor port", f"{address} is not answered by this home's process" + (f" ({why})" if taken else ""),
+        reason = f" ({why})" if taken else ""
+        yield broken("monitor port", f"{address} is not answered by this home's process{reason}",
                      "stop what has the port, or correct `monitor`; then start again")
 
 
