@@ -67,6 +67,8 @@ ROBOTS = 2
 class AnvilNode:
     """Every fault, by anvil's own calls."""
 
+    floor = 0  # the chain turns back to this block at most: there the robots are registered
+
     def __init__(self, dice: random.Random) -> None:
         pace = dice.choice([0.5, 1.0])
         self._anvil = Anvil.start(clique.free_ports(1)[0], block_time=pace, options=["--silent"])
@@ -85,7 +87,7 @@ class AnvilNode:
     def reorg(self, depth: int) -> None:
         """What the blocks held is gone; half the time it is handed to the node again, as its peers would."""
         head = int(self.ask("eth_blockNumber"), 16)
-        depth = min(depth, head - 6)
+        depth = min(depth, head - self.floor)
         if depth < 1:
             return
         raws = []
@@ -108,6 +110,8 @@ class AnvilNode:
 class CliqueNode:
     """A geth that signs alone, a block a second. It has no call to lose transactions: it is started anew instead."""
 
+    floor = 0
+
     def __init__(self, dice: random.Random, folder: Path) -> None:
         self._network = clique.Network(folder, {KEYS.operator.address: 1000 * ETH}, signers=1, period=1)
         self._node = self._network.nodes[0]
@@ -122,7 +126,7 @@ class CliqueNode:
 
     def reorg(self, depth: int) -> None:
         head = self._node.height()
-        if head - depth > 6:
+        if head - depth >= self.floor:
             self.ask("debug_setHead", hex(head - depth))
 
     def spike(self) -> None:
@@ -256,6 +260,7 @@ class World:
         self.robots = [Robot(n, self.ledger.ledger, dice) for n in range(1, ROBOTS + 1)]
         for robot in self.robots:
             self.ledger.registration(KEYS.operator, robot.tk, robot.account.address, b"certificates")
+        self.node.floor = self.ledger.block_number()
         self.proxy = Proxy(self.node.url)
         stack.callback(self.proxy.close)
         self.folder, self.inboxes, self.copy = folder, 0, None

@@ -7,7 +7,6 @@ session that is tried is given back.
 from __future__ import annotations
 
 import http.client
-import importlib.util
 import json as jsonlib
 import os
 import socket
@@ -41,7 +40,6 @@ from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, pri
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger
 
-PACKAGES = ("eth_account", "prometheus_client", "pydantic", "redis", "rich", "rosbags", "typer", "web3")
 HANDSHAKE_TIME = 6.0  # seconds for a server to answer
 ATTEMPT_TIME = 2.5  # seconds for one attempt; what a server says of a refusal is known when it ends
 EXPIRY = timedelta(days=30)
@@ -87,14 +85,6 @@ def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Fi
 
 
 # The machine
-
-
-def packages(home: Path, secret: bytes | None) -> Findings:
-    absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    if absent:
-        yield broken("packages", "not installed: " + ", ".join(absent), "pip install 'pysmcrypto[bridge]'")
-    else:
-        yield ok("packages", "all there")
 
 
 def clock(home: Path, secret: bytes | None) -> Findings:
@@ -445,7 +435,7 @@ def reader_nodes(home: Path, secret: bytes | None) -> Findings:
             yield from examine({"node": lambda home, secret, ask=ask: ask()}, home, secret)  # type: ignore[misc]
 
 
-_MACHINE: dict[str, Check] = {"packages": packages, "clock": clock, "home": files, "disk": disk}
+_MACHINE: dict[str, Check] = {"clock": clock, "home": files, "disk": disk}
 CHECKS: dict[HomeKind, dict[str, Check]] = {
     HomeKind.OPERATOR: _MACHINE | {
         "configuration": operator_configuration, "certificates": operator_certificates,
