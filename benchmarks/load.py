@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import multiprocessing
 import os
 import platform
@@ -435,6 +436,7 @@ def client_process(
     report: Connection, limit: float,
 ) -> None:
     """Several robots in one process. It reports after each phase and waits for the word to go on."""
+    logging.getLogger("rosbridge_eth").setLevel(logging.ERROR)  # that a session takes long is in the figures
     sessions = [Session(operator, robot, server) for robot in robots]
     sealed: dict[bytes, bytes] = {}
     for session in sessions:
