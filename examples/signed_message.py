@@ -3,11 +3,11 @@
 Run it: python examples/signed_message.py
 """
 
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 
 from smcrypto import CertificateError, cms, pkcs12, sm2, x509
 
-now = datetime.now(UTC).replace(microsecond=0)
+now = datetime.now(timezone.utc).replace(microsecond=0)
 year = {"not_before": now, "not_after": now + timedelta(days=365)}
 
 # A root that both sides trust, a company that signs, and a bank whose certificate is for encryption.

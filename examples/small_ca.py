@@ -3,11 +3,11 @@
 Run it: python examples/small_ca.py
 """
 
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 
 from smcrypto import CertificateError, sm2, x509
 
-now = datetime.now(UTC).replace(microsecond=0)
+now = datetime.now(timezone.utc).replace(microsecond=0)
 
 
 def days(n: int) -> dict[str, datetime]:
