@@ -146,12 +146,10 @@ class UdpLoop:
 
     def wake(self) -> None:
         """Make a waiting `step` return, from any thread or a signal handler; nothing happens once it is closed."""
-        if self._wake_send.fileno() < 0:
-            return
         try:
             self._wake_send.send(b"\0")
-        except BlockingIOError:
-            return  # wake-ups enough are waiting already
+        except OSError:
+            return  # wake-ups enough are waiting already, or another thread has just closed the loop
 
     def step(self, longest: float) -> None:
         """Send what may be sent; wait for something, at most `longest` seconds; take it and give out its events."""
