@@ -8,6 +8,7 @@ import json
 import logging
 import secrets
 import struct
+import threading
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +44,8 @@ class Seen:
         datagrams, logs = list[bytes](), io.StringIO()
         handler = logging.StreamHandler(logs)
         handler.setFormatter(TextFormatter())
+        others = {thread.ident for thread in threading.enumerate()} - {threading.get_ident()}
+        handler.addFilter(lambda record: record.thread not in others)  # what another test left running is not this run
         logger = logging.getLogger(LOGGER)
         logger.addHandler(handler)
         patch.setattr(logger, "level", logging.DEBUG)

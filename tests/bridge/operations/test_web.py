@@ -24,7 +24,8 @@ SLOW = 16
 
 
 @pytest.fixture
-def web() -> Iterator[Web]:
+def web(monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
+    monkeypatch.delenv("PROMETHEUS_MULTIPROC_DIR", raising=False)
     made = Web(("127.0.0.1", 0), ["robot"])
     metrics.beat("robot", time.time())
     metrics.CONDITION.labels("robot has a session").set(1)

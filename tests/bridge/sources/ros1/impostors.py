@@ -103,6 +103,8 @@ def answering(body: bytes) -> Conversation:
     def conversation(connection: socket.socket) -> None:
         connection.recv(65536)
         connection.sendall(b"HTTP/1.0 200 OK\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
+        while connection.recv(65536):  # as in `saying`
+            pass
 
     return conversation
 
@@ -113,7 +115,10 @@ def saying(data: bytes, *, then_stay: bool = False) -> Conversation:
     def conversation(connection: socket.socket) -> None:
         connection.recv(65536)
         connection.sendall(data)
-        while then_stay and connection.recv(65536):
+        if not then_stay:
+            connection.shutdown(socket.SHUT_WR)
+        # Closed with something unread, the connection would be reset, and what was said might never arrive.
+        while connection.recv(65536):
             pass
 
     return conversation
