@@ -208,8 +208,7 @@ def _read_attributes(attributes: der.Reader, content: bytes) -> tuple[bytes, dat
     values: dict[str, bytes] = {}
     while not attributes.at_end():
         parts.append(attributes.checked())
-        outer = der.Reader(parts[-1])
-        attribute = outer.sequence()
+        attribute = der.only_sequence(parts[-1])
         kind = attribute.oid()
         members = attribute.set_of()
         attribute.finish()
@@ -410,9 +409,7 @@ def _message(kind: str, *parts: bytes) -> bytes:
 
 def _opened(data: bytes, kind: str) -> der.Reader:
     """The body of a ContentInfo of this kind, its version read."""
-    outer = der.Reader(pem.first(data, _LABELS).der if b"-----BEGIN " in data else data)
-    info = outer.sequence()
-    outer.finish()
+    info = der.only_sequence(pem.first(data, _LABELS).der if b"-----BEGIN " in data else data)
     name = info.oid()
     if _KINDS.get(name) != kind:
         raise InvalidEncoding(f"the message is of the kind {name}, not {kind}")

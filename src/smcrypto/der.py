@@ -56,6 +56,7 @@ __all__ = [
     "null",
     "octet_string",
     "oid",
+    "only_sequence",
     "sequence",
     "set_of",
     "time",
@@ -344,6 +345,14 @@ def check(data: BytesLike) -> bytes:
     value = reader.checked()
     reader.finish()
     return value
+
+
+def only_sequence(data: BytesLike) -> Reader:
+    """A reader of what is inside the one SEQUENCE that `data` is; InvalidEncoding if anything follows it."""
+    outer = Reader(data)
+    inner = outer.sequence()
+    outer.finish()
+    return inner
 
 
 def _split_bits(content: bytes) -> tuple[int, bytes]:

@@ -133,7 +133,7 @@ def load(data: BytesLike, password: BytesLike) -> Contents:
     try:
         safe = _authenticated(octets, secret)
         bags: list[_Bag] = []
-        contents = _whole(safe)
+        contents = der.only_sequence(safe)
         while not contents.at_end():
             bags += _read_content(contents.sequence(), secret)
     except InvalidPadding:
@@ -156,7 +156,7 @@ def load(data: BytesLike, password: BytesLike) -> Contents:
 
 def _authenticated(data: bytes, password: bytes) -> bytes:
     """The AuthenticatedSafe of a PFX, RFC 7292, 4, after its MAC was found right."""
-    pfx = _whole(data)
+    pfx = der.only_sequence(data)
     if pfx.integer() != 3:
         raise InvalidEncoding("the version is not 3")
     content = pfx.sequence()
@@ -231,14 +231,6 @@ class _Bag(NamedTuple):
     name: str | None
 
 
-def _whole(data: bytes) -> der.Reader:
-    """A reader of what is in the one SEQUENCE that `data` is."""
-    outer = der.Reader(data)
-    sequence = outer.sequence()
-    outer.finish()
-    return sequence
-
-
 def _read_content(content: der.Reader, password: bytes) -> list[_Bag]:
     """One ContentInfo of the AuthenticatedSafe: SafeContents, plain or encrypted."""
     name = content.oid()
@@ -262,7 +254,7 @@ def _read_content(content: der.Reader, password: bytes) -> list[_Bag]:
         raise InvalidEncoding(f"contents of the kind {name}")
     wrapped.finish()
     bags: list[_Bag] = []
-    safe = _whole(octets)
+    safe = der.only_sequence(octets)
     while not safe.at_end():
         bags.append(_read_bag(safe.sequence(), password))
     return bags
@@ -276,7 +268,7 @@ def _read_bag(bag: der.Reader, password: bytes) -> _Bag:
     name = None if bag.at_end() else _read_name(bag.set_of())
     bag.finish()
     if kind == _CERT_BAG:
-        members = _whole(value)
+        members = der.only_sequence(value)
         if members.oid() != _X509_CERTIFICATE:
             raise InvalidEncoding("a certificate that is not X.509")
         inner = members.explicit(0)

@@ -47,9 +47,7 @@ def open_key(data: bytes, key: PrivateKey) -> PrivateKey:
     from smcrypto import sm4
 
     try:
-        outer = der.Reader(data)
-        members = outer.sequence()
-        outer.finish()
+        members = der.only_sequence(data)
         algorithm = members.sequence()
         name = algorithm.oid()
         if name not in _ALGORITHMS:

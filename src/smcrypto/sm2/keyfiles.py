@@ -119,9 +119,7 @@ def load_public(data: bytes, *, form: Form) -> bytes:
             data = pem.first(data, [_PUBLIC_LABEL]).der
         else:
             _require_form(form)
-        outer = der.Reader(data)
-        info = outer.sequence()
-        outer.finish()
+        info = der.only_sequence(data)
         _read_algorithm(info)
         point = info.bit_string()
         info.finish()
@@ -156,9 +154,7 @@ def _private_from_pem(data: bytes, password: bytes | None) -> int:
 
 def _private_from_der(data: bytes, password: bytes | None) -> int:
     """The three structures differ in the tags of their first two members."""
-    outer = der.Reader(data)
-    members = outer.sequence()
-    outer.finish()
+    members = der.only_sequence(data)
     if members.peek_tag() == der.SEQUENCE:
         return _decrypted(data, password)
     _require_no_password(password)
@@ -175,9 +171,7 @@ def _require_no_password(password: bytes | None) -> None:
 
 def _read_pkcs8(data: bytes) -> int:
     """OneAsymmetricKey, RFC 5958, 2; version 0 is the PrivateKeyInfo of RFC 5208."""
-    outer = der.Reader(data)
-    info = outer.sequence()
-    outer.finish()
+    info = der.only_sequence(data)
     version = info.integer()
     if version not in (0, 1):
         raise InvalidEncoding(f"PKCS#8 version {version}")
@@ -214,9 +208,7 @@ def _read_sec1(data: bytes, *, curve_known: bool) -> int:
     The parameters may be missing where something else says that the curve is
     SM2's: what surrounds the key, or its public key, which fits one curve only.
     """
-    outer = der.Reader(data)
-    key = outer.sequence()
-    outer.finish()
+    key = der.only_sequence(data)
     version = key.integer()
     if version != 1:
         raise InvalidEncoding(f"ECPrivateKey version {version}")
@@ -297,9 +289,7 @@ def _explicit_parameters() -> frozenset[bytes]:
 
 def _decrypted(data: bytes, password: bytes | None) -> int:
     """d of an EncryptedPrivateKeyInfo, RFC 5958, 3."""
-    outer = der.Reader(data)
-    info = outer.sequence()
-    outer.finish()
+    info = der.only_sequence(data)
     scheme = info.sequence()
     ciphertext = info.octet_string()
     info.finish()

@@ -1,13 +1,13 @@
-"""Certificate extensions: RFC 5280, 4.2.
+"""Extensions of certificates, requests and revocation lists: RFC 5280, 4.2 and 5.2.
 
 An `Extension` keeps identifier, criticality and the bytes of its value. Those
-that this library understands are read when the
-certificate is, so that one which cannot be read is refused at once.
+that this library understands are read when the certificate is (`values`), so
+that one which cannot be read is refused at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Final
@@ -34,6 +34,8 @@ SUBJECT_KEY_IDENTIFIER: Final = "2.5.29.14"
 KEY_USAGE: Final = "2.5.29.15"
 SUBJECT_ALT_NAME: Final = "2.5.29.17"
 BASIC_CONSTRAINTS: Final = "2.5.29.19"
+CRL_NUMBER: Final = "2.5.29.20"
+REASON_CODE: Final = "2.5.29.21"
 NAME_CONSTRAINTS: Final = "2.5.29.30"
 AUTHORITY_KEY_IDENTIFIER: Final = "2.5.29.35"
 EXTENDED_KEY_USAGE: Final = "2.5.29.37"
@@ -63,6 +65,20 @@ _PURPOSES: Final = {
     "anyExtendedKeyUsage": "2.5.29.37.0",
 }
 _PURPOSE_NAMES: Final = {oid: name for name, oid in _PURPOSES.items()}
+
+# Why a certificate was revoked, 5.3.1; 7 is not used, 8 (removeFromCRL) belongs to delta lists.
+REASONS: Final = {
+    "unspecified": 0,
+    "keyCompromise": 1,
+    "cACompromise": 2,
+    "affiliationChanged": 3,
+    "superseded": 4,
+    "cessationOfOperation": 5,
+    "certificateHold": 6,
+    "privilegeWithdrawn": 9,
+    "aACompromise": 10,
+}
+_REASON_NAMES: Final = {code: name for name, code in REASONS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,13 +140,21 @@ def read_extensions(reader: der.Reader) -> tuple[Extension, ...]:
     return tuple(found.values())
 
 
+def read_optional(body: der.Reader, number: int) -> tuple[Extension, ...]:
+    """The extensions under the explicit tag [number], none where that is absent."""
+    if not body.has_explicit(number):
+        return ()
+    wrapped = body.explicit(number)
+    extensions = read_extensions(wrapped)
+    wrapped.finish()
+    return extensions
+
+
 # --- one function to read and one to write each extension ---
 
 
 def read_basic_constraints(value: bytes) -> BasicConstraints:
-    outer = der.Reader(value)
-    sequence = outer.sequence()
-    outer.finish()
+    sequence = der.only_sequence(value)
     ca, path_length = False, None
     if sequence.peek_tag() == der.BOOLEAN:
         ca = sequence.boolean()
@@ -177,9 +201,7 @@ def key_usage(names: Iterable[str]) -> Extension:
 
 
 def read_extended_key_usage(value: bytes) -> tuple[str, ...]:
-    outer = der.Reader(value)
-    sequence = outer.sequence()
-    outer.finish()
+    sequence = der.only_sequence(value)
     purposes: list[str] = []
     while not sequence.at_end():
         oid = sequence.oid()
@@ -232,9 +254,7 @@ def authority_key_identifier(identifier: bytes) -> Extension:
 
 
 def read_authority_key_identifier(value: bytes) -> AuthorityKeyIdentifier:
-    outer = der.Reader(value)
-    sequence = outer.sequence()
-    outer.finish()
+    sequence = der.only_sequence(value)
     identifier = sequence.implicit(0) if sequence.has_implicit(0) else None
     issuer = serial = None
     if sequence.has_explicit(1):
@@ -252,6 +272,30 @@ def read_authority_key_identifier(value: bytes) -> AuthorityKeyIdentifier:
     return AuthorityKeyIdentifier(identifier, issuer, serial)
 
 
+def crl_number(number: int) -> Extension:
+    return Extension(CRL_NUMBER, False, der.integer(number))
+
+
+def read_crl_number(value: bytes) -> int:
+    reader = der.Reader(value)
+    number = reader.integer()
+    reader.finish()
+    return number
+
+
+def reason_code(reason: str) -> Extension:
+    return Extension(REASON_CODE, False, der.enumerated(REASONS[reason]))
+
+
+def read_reason_code(value: bytes) -> str:
+    reader = der.Reader(value)
+    reason = reader.enumerated()
+    reader.finish()
+    if reason not in _REASON_NAMES:
+        raise CertificateError(f"revocation reason {reason} has no meaning in a complete list")
+    return _REASON_NAMES[reason]
+
+
 # --- GeneralName, 4.2.1.6, as text "KIND:value" ---
 
 _IA5_KINDS: Final = {1: "email", 2: "DNS", 6: "URI"}
@@ -259,9 +303,7 @@ _IA5_TAGS: Final = {name.lower(): tag for tag, name in _IA5_KINDS.items()}
 
 
 def read_subject_alt_names(value: bytes) -> tuple[str, ...]:
-    outer = der.Reader(value)
-    sequence = outer.sequence()
-    outer.finish()
+    sequence = der.only_sequence(value)
     names: list[str] = []
     while not sequence.at_end():
         names.append(_read_general_name(sequence))
@@ -314,6 +356,29 @@ def _general_name(text: str) -> bytes:
     if colon and kind == "dirName":
         return der.explicit(4, Name.from_rfc4514(value).to_der())
     raise InvalidOption(f"{text!r} is not 'URI:…', 'DNS:…', 'email:…', 'IP:…' or 'dirName:…'")
+
+# What the extensions say that are understood, by the name of the field that holds it: identifier, reader of the value,
+# and what stands for an extension that is not there.
+_FIELDS: Final[dict[str, tuple[str, Callable[[bytes], object], object]]] = {
+    "basic_constraints": (BASIC_CONSTRAINTS, read_basic_constraints, None),
+    "key_usage": (KEY_USAGE, read_key_usage, None),
+    "extended_key_usage": (EXTENDED_KEY_USAGE, read_extended_key_usage, None),
+    "subject_alt_names": (SUBJECT_ALT_NAME, read_subject_alt_names, ()),
+    "subject_key_identifier": (SUBJECT_KEY_IDENTIFIER, read_subject_key_identifier, None),
+    "authority_key_identifier": (AUTHORITY_KEY_IDENTIFIER, read_authority_key_identifier, None),
+    "number": (CRL_NUMBER, read_crl_number, None),
+    "reason": (REASON_CODE, read_reason_code, "unspecified"),
+}
+
+
+def values(extensions: Iterable[Extension], *fields: str) -> dict[str, object]:
+    """What `extensions` say for each of `fields`; those of other kinds are not looked at."""
+    present = {extension.oid: extension.value for extension in extensions}
+    found: dict[str, object] = {}
+    for field in fields:
+        oid, read, absent = _FIELDS[field]
+        found[field] = read(present[oid]) if oid in present else absent
+    return found
 
 
 def requested(

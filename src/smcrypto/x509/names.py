@@ -122,8 +122,7 @@ class Name:
     def read(cls, reader: der.Reader) -> Name:
         """Name ::= RDNSequence, X.501, 9.2. CertificateError for a string that is not one."""
         encoded = reader.raw()
-        outer = der.Reader(encoded)
-        sequence = outer.sequence()
+        sequence = der.only_sequence(encoded)
         rdns: list[tuple[Attribute, ...]] = []
         while not sequence.at_end():
             members = sequence.set_of()

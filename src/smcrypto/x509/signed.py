@@ -1,6 +1,7 @@
 """What certificates, requests and revocation lists have in common: a body, an algorithm, a signature.
 
-RFC 5280, 4.1.1: SEQUENCE { body, AlgorithmIdentifier, BIT STRING }. The
+RFC 5280, 4.1.1: SEQUENCE { body, AlgorithmIdentifier, BIT STRING }. `Signed` reads it and has the class of each
+read its body, once and in full; the result does not change. The
 signature covers the body's bytes as they were received; nothing is encoded
 again to be verified. The algorithm is SM2-with-SM3, GM/T 0015 and RFC 8998.
 """
@@ -9,17 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, TypeVar
 
 from smcrypto import der, pem, sm2
-from smcrypto.errors import (
-    CertificateError,
-    InvalidEncoding,
-    InvalidKey,
-    InvalidOption,
-    InvalidSignature,
-)
+from smcrypto.errors import CertificateError, InvalidEncoding, InvalidKey, InvalidOption, InvalidSignature
+from smcrypto.inputs import BytesLike, as_bytes
 
 __all__ = [
     "SM2_WITH_SM3",
@@ -27,9 +24,7 @@ __all__ = [
     "CertificateSignatureError",
     "Signed",
     "instant",
-    "one_block",
     "parsing",
-    "read_signed",
     "sign",
 ]
 
@@ -46,27 +41,6 @@ class CertificateRevokedError(CertificateError):
     """A revocation list of its issuer names the certificate."""
 
 
-class Signed(NamedTuple):
-    body: bytes
-    algorithm: bytes
-    signature: bytes
-
-    def fields(self) -> der.Reader:
-        """A reader of what the body, one SEQUENCE, holds."""
-        outer = der.Reader(self.body)
-        body = outer.sequence()
-        outer.finish()
-        return body
-
-    def verify(self, public_key: sm2.PublicKey, uid: bytes, what: str) -> None:
-        if self.algorithm not in _ACCEPTED:
-            raise CertificateError(f"{what} is not signed with SM2-with-SM3, the only algorithm supported")
-        try:
-            public_key.verify(self.signature, self.body, uid=uid)
-        except InvalidSignature:
-            raise CertificateSignatureError(f"the signature of {what} does not hold") from None
-
-
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
     """Every way in which bytes are not a `what` is a CertificateError that says so."""
@@ -76,21 +50,87 @@ def parsing(what: str) -> Iterator[None]:
         raise CertificateError(f"not a valid {what}: {error}") from None
 
 
-def one_block(data: bytes, labels: tuple[str, ...], what: str) -> bytes:
-    """The content of the first PEM block with one of `labels`."""
-    with parsing(what):
-        return pem.first(data, labels).der
+_T = TypeVar("_T", bound="Signed")
 
 
-def read_signed(data: bytes) -> Signed:
-    outer = der.Reader(data)
-    sequence = outer.sequence()
-    outer.finish()
-    body = sequence.raw()
-    algorithm = sequence.checked()
-    signature = sequence.bit_string()
-    sequence.finish()
-    return Signed(body, algorithm, signature)
+@dataclass(frozen=True, slots=True, init=False, eq=False, repr=False)
+class Signed:
+    """One certificate, request or revocation list, read in full, so that what exists is well formed."""
+
+    KIND: ClassVar[str]
+    """What it is called in messages."""
+    LABELS: ClassVar[tuple[str, ...]]
+    """Of PEM blocks, RFC 7468: the first is written, the others are read as well."""
+
+    signature: bytes
+    """As it stands in it: the DER of GM/T 0009."""
+    _der: bytes
+    _body: bytes  # what the signature covers
+    _algorithm: bytes
+
+    def __init__(self) -> None:
+        raise TypeError(f"a {self.KIND} is read by from_pem or from_der, or made by a function that signs it")
+
+    @classmethod
+    def from_pem(cls: type[_T], data: BytesLike) -> _T:
+        """The first one in `data`; text and other blocks around it are skipped. Errors as of `from_der`."""
+        octets = as_bytes(data, "data")
+        with parsing(cls.KIND):
+            content = pem.first(octets, cls.LABELS).der
+        return cls.from_der(content)
+
+    @classmethod
+    def from_der(cls: type[_T], data: BytesLike) -> _T:
+        """CertificateError for anything but the DER of one, with an SM2 key. The signature is not verified here."""
+        octets = as_bytes(data, "data")
+        made = object.__new__(cls)
+        with parsing(cls.KIND):
+            outer = der.only_sequence(octets)
+            body, algorithm, signature = outer.raw(), outer.checked(), outer.bit_string()
+            outer.finish()
+            made._fill(_der=octets, _body=body, _algorithm=algorithm, signature=signature)
+            fields = der.only_sequence(body)
+            made._read(fields)
+            fields.finish()
+        return made
+
+    def _read(self, body: der.Reader) -> None:
+        """Fill the fields of this class with what stands in the body."""
+        raise NotImplementedError
+
+    def _fill(self, **fields: object) -> None:
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def _require_same_algorithm(self, body: der.Reader) -> None:
+        """RFC 5280, 4.1.1.2 and 5.1.1.2: it is stated twice, once within what is signed."""
+        if body.raw() != self._algorithm:
+            raise CertificateError("the two statements of the signature algorithm differ (RFC 5280, 4.1.1.2)")
+
+    def _verify(self, public_key: sm2.PublicKey, uid: bytes, what: str) -> None:
+        if self._algorithm not in _ACCEPTED:
+            raise CertificateError(f"{what} is not signed with SM2-with-SM3, the only algorithm supported")
+        try:
+            public_key.verify(self.signature, self._body, uid=uid)
+        except InvalidSignature:
+            raise CertificateSignatureError(f"the signature of {what} does not hold") from None
+
+    def to_der(self) -> bytes:
+        """The bytes it was read from, or made as."""
+        return self._der
+
+    def to_pem(self) -> bytes:
+        """The same as PEM."""
+        return pem.encode(self.LABELS[0], self._der)
+
+    def __eq__(self, other: object) -> bool:
+        return self._der == other._der if isinstance(other, Signed) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._der)
+
+    def __reduce__(self: _T) -> tuple[object, tuple[bytes]]:
+        return type(self).from_der, (self._der,)
 
 
 def sign(body: bytes, key: sm2.PrivateKey, uid: bytes) -> bytes:
