@@ -2,7 +2,7 @@
 
     python benchmarks/chain_interaction.py [--clients N] [--period SECONDS] [--chain clique|anvil] [--json FILE]
 
-The chain is three geth nodes that sign by proof of authority (clique.py), or
+The chain is three geth nodes that sign by proof of authority (geth_network.py), or
 anvil. Eight processes make the requests, as in the paper. The operator
 registers and funds the clients; each client then writes records of 256 bytes
 with `setData` from its own account, and asks for each with `checkData`.
@@ -29,7 +29,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import clique
+import geth_network
 from eth_utils.crypto import keccak
 
 from rosbridge_eth.chunk import robot_id
@@ -49,11 +49,11 @@ def network(kind: str, clients: int, period: int) -> Iterator[list[str]]:
     """The URLs of its nodes."""
     with tempfile.TemporaryDirectory(prefix="interaction-") as folder:
         if kind == "clique":
-            with clique.Network(Path(folder), {KEYS.operator.address: 10_000 * ETH}, period=period) as running:
+            with geth_network.Network(Path(folder), {KEYS.operator.address: 10_000 * ETH}, period=period) as running:
                 running.await_blocks(3)
                 yield [node.url for node in running.nodes]
         else:
-            with Anvil.start(clique.free_ports(1)[0], block_time=period) as node:
+            with Anvil.start(geth_network.free_ports(1)[0], block_time=period) as node:
                 node.fund(KEYS.operator.address, 10_000)
                 for client in range(1, clients + 1):  # some of them are those that anvil makes rich
                     node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")
@@ -182,7 +182,7 @@ def main() -> int:
     options = parser.parse_args()
     try:
         found = measure(options.chain, options.clients, options.period)
-    except clique.Unavailable as reason:
+    except geth_network.Unavailable as reason:
         print(reason, file=sys.stderr)
         return 1
     print(report(options.chain, options.clients, found))

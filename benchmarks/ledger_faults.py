@@ -42,7 +42,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import clique
+import geth_network
 import requests
 
 from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
@@ -71,7 +71,7 @@ class AnvilNode:
 
     def __init__(self, dice: random.Random) -> None:
         pace = dice.choice([0.5, 1.0])
-        self._anvil = Anvil.start(clique.free_ports(1)[0], block_time=pace, options=["--silent"])
+        self._anvil = Anvil.start(geth_network.free_ports(1)[0], block_time=pace, options=["--silent"])
         self.url, self.ask, self._dice = self._anvil.url, self._anvil.ask, dice
         for number in range(ROBOTS + 1):
             self.ask("anvil_setBalance", KEYS.account(number).address, hex(1000 * ETH if number == 0 else 0))
@@ -113,7 +113,7 @@ class CliqueNode:
     floor = 0
 
     def __init__(self, dice: random.Random, folder: Path) -> None:
-        self._network = clique.Network(folder, {KEYS.operator.address: 1000 * ETH}, signers=1, period=1)
+        self._network = geth_network.Network(folder, {KEYS.operator.address: 1000 * ETH}, nodes=1, period=1)
         self._node = self._network.nodes[0]
         self.url, self.ask, self._dice = self._node.url, self._node.request, dice
         self._network.await_blocks(2)
@@ -459,7 +459,7 @@ def main(arguments: list[str] | None = None, say: Callable[[str], None] = print)
     for seed in range(int(first), int(end)):
         try:
             result = run(options.chain, seed, options.seconds)
-        except clique.Unavailable as reason:
+        except geth_network.Unavailable as reason:
             print(reason, file=sys.stderr)
             return 1
         except Exception:

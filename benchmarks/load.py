@@ -1,7 +1,7 @@
 """Many robots at once: from their handshakes to the chain, each stage counted and timed.
 
     python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--per-chunk 1]
-                              [--store sqlite|redis|URL] [--chain anvil|embedded] [--workers 2] [--json FILE]
+                              [--store sqlite|redis|URL] [--chain anvil|embedded|clique] [--workers 2] [--json FILE]
 
 The paper's blockchain end received 2,994, 4,986 and 6,991 messages of 300, 500
 and 700 clients that sent 10 each, and so lost 0.23 % (Security and
@@ -49,6 +49,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import geth_network
+
 from rosbridge_eth import server as door
 from rosbridge_eth.administration import deploy_contract, init_home, load_server_identity, register_robot
 from rosbridge_eth.bundle import Request, read_bundle
@@ -69,7 +71,8 @@ from rosbridge_eth.identity import (
     load_identity,
     public_identity,
 )
-from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.contract import Receipt, call_gas
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
 from rosbridge_eth.reading import Verifier
 from rosbridge_eth.registry import Registry
@@ -86,6 +89,7 @@ TOPIC = "/robot_1/odom"
 PAPER = {300: 2994, 500: 4986, 700: 6991}
 FORK = multiprocessing.get_context("fork")
 RICH = 100_000
+SETTLING = 180.0
 MIB = 1 << 20
 DURABLE = ("--appendonly", "yes", "--appendfsync", "always", "--maxmemory-policy", "noeviction", "--save", "")
 
@@ -133,15 +137,44 @@ class Figures:
 # --- the operator: a home, a chain, a contract, robots
 
 
+class Unwaited(Ledger):
+    """The operator's transactions one behind the other, without waiting for the block of each; then `settle`."""
+
+    def transact(self, account: Any, function: str, *arguments: Any, value: int = 0, wait: float = 120.0) -> Receipt:
+        if not hasattr(self, "_next"):
+            self._next, self._sent = self.nonces([account.address])[0][0], list[bytes]()
+            self._at = self.fees(self.block())
+        data = self.calldata(function, *arguments)
+        signed = self.sign(account, data, nonce=self._next, gas=call_gas(data), fees=self._at, value=value)
+        [refused] = self.send([signed.raw])
+        if refused is not None:
+            raise refused
+        self._next += 1
+        self._sent.append(signed.hash)
+        return Receipt(signed.hash, 0, True, 0, None)
+
+    def settle(self) -> None:
+        """Until blocks hold all of them."""
+        for hash in getattr(self, "_sent", []):
+            deadline = time.monotonic() + SETTLING
+            while (receipt := self.receipt(hash)) is None:
+                if time.monotonic() > deadline:
+                    raise SystemExit("a registration is in no block")
+                time.sleep(0.2)
+            if not receipt.succeeded:
+                raise SystemExit("a registration failed")
+
+
 class Operator:
     """An operator's home with many robots registered and funded, and the chain they write to.
 
-    settings: TOML for server.toml, besides what `init` writes.
+    chain: "anvil", "embedded", "clique" (three nodes here, a block a second), or a network that runs elsewhere, where
+    `keys` has money. settings: TOML for server.toml, besides what `init` writes.
     """
 
     def __init__(
         self, folder: Path, chain: str, store: str, robots: int, on_stage: Callable[[str], None], settings: str = "",
-        listen: str = "127.0.0.1:0",
+        listen: str = "127.0.0.1:0", keys: Keyring | None = None, confirmations: int = 1,
     ) -> None:  # fmt: skip
         self._stack = ExitStack()
         self.folder, self.chain_kind, self.store_kind = folder, chain, store
@@ -154,17 +187,26 @@ class Operator:
             # Blocks come when there is something to write: the node is not what is measured.
             self.anvil = self._stack.enter_context(Anvil.start(_free_port()))
             where = self.anvil.url
+        elif chain == "clique":
+            keys = Keyring.create()
+            network = geth_network.Network(folder / "network", {keys.operator.address: RICH * 10**18})
+            self._stack.callback(network.close)
+            network.await_blocks(3)
+            where = network.nodes[0].url
+        elif chain != "embedded":
+            where = chain
         self.keys = init_home(
             self.home, self.passphrase, reader=self.reader_home, reader_passphrase=self.passphrase, now=now,
             listen=listen, public="127.0.0.1:7410", chain_url=where,
+            keys=keys,
         )
-        more = f'confirmations = 1\n\n[store]\nurl = "{self._open_store(folder, store)}"\n{settings}'
+        more = f'confirmations = {confirmations}\n\n[store]\nurl = "{self._open_store(folder, store)}"\n{settings}'
         with self.home.config.open("a") as file:
             file.write(more)
         self.config = load_server_config(self.home.config)
         if self.anvil is not None:
             self.anvil.fund(self.keys.operator.address, RICH)
-        else:
+        elif chain == "embedded":
             where = EmbeddedChain(fund={self.keys.operator.address: RICH * 10**18})
         self._where = where
         self.deployment = deploy_contract(self.home, where, self.keys)
@@ -174,7 +216,11 @@ class Operator:
         self.trust = Trust(roots)
         on_stage(f"{robots} robots: keys, certificates, accounts, registrations in the contract")
         ca = load_ca(self.home.ca, self.passphrase, now)
-        self.robots = [self._register(ca, f"robot_{number}", now) for number in range(1, robots + 1)]
+        registrar = Unwaited(where, self.deployment.contract, self.deployment) if keys is not None else self.ledger
+        self.robots = [self._register(registrar, ca, f"robot_{number}", now) for number in range(1, robots + 1)]
+        if isinstance(registrar, Unwaited):
+            registrar.settle()
+            registrar.close()
         self.sealed: dict[bytes, bytes] = {}
         """By digest, the chunks of all runs."""
         self.spools = folder / "spools"
@@ -195,11 +241,11 @@ class Operator:
             time.sleep(0.02)
         return f"redis://127.0.0.1:{port}/0"
 
-    def _register(self, ca: CertificateAuthority, name: str, now: datetime) -> Identity:
+    def _register(self, ledger: Ledger, ca: CertificateAuthority, name: str, now: datetime) -> Identity:
         """As `join` and `register` do it; only the keys are kept in no file."""
         keys = [sm2.PrivateKey.generate() for _ in range(2)]
         made = register_robot(
-            self.home, name, ca=ca, keys=self.keys, ledger=self.ledger, now=now, request=Request.make(name, *keys),
+            self.home, name, ca=ca, keys=self.keys, ledger=ledger, now=now, request=Request.make(name, *keys),
             inbox=lambda: open_store(self.config, self.home),
         )
         files = read_bundle(made.bundle.read_bytes()).certificates
@@ -658,7 +704,7 @@ def main() -> None:
     parser.add_argument("--per-chunk", type=int, default=1, help="messages in a chunk")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--store", default="sqlite", help="sqlite, redis (started here) or the URL of one")
-    parser.add_argument("--chain", choices=["anvil", "embedded"],
+    parser.add_argument("--chain", choices=["anvil", "embedded", "clique"],
                         default="anvil" if shutil.which("npx") or shutil.which("anvil") else "embedded")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
     options = parser.parse_args()

@@ -19,6 +19,13 @@ settings.register_profile("thorough", deadline=None, max_examples=5000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Coverage is asked of the library alone; its tracing would make the bridge's tests take twice the time."""
+    for item in items:
+        if "bridge" in item.path.parts:
+            item.add_marker(pytest.mark.no_cover)
+
+
 def unavailable(reason: str) -> None:
     """Skip the test for this reason, or fail where services are required."""
     if os.environ.get("REQUIRE_SERVICES") == "1":

@@ -10,13 +10,13 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import shutil
 import signal
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from socket import AF_UNIX, SOCK_CLOEXEC, SOCK_DGRAM
@@ -165,8 +165,10 @@ class Supervisor:
         it is started. on_ready: called with the address that is listened on.
         """
         self._check()
-        counts = tempfile.mkdtemp(prefix="rosbridge-eth-")
-        os.environ["PROMETHEUS_MULTIPROC_DIR"] = counts  # read when prometheus_client is first imported
+        with _shared_figures():
+            self._run(on_ready)
+
+    def _run(self, on_ready: Callable[[tuple[str, int]], None]) -> None:
         sockets = server_sockets(self._config.listen, self._config.workers)
         tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
         for number, sock in enumerate(sockets):
@@ -189,7 +191,6 @@ class Supervisor:
             self._end()
             for sock in sockets:
                 sock.close()
-            shutil.rmtree(counts, ignore_errors=True)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.stop()
@@ -320,6 +321,17 @@ class Supervisor:
 
     def _open_store(self) -> Inbox:
         return open_store(self._config, self._home)
+
+
+@contextmanager
+def _shared_figures() -> Iterator[None]:
+    """A folder for what the processes count, named where prometheus_client looks when it is first imported."""
+    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-", ignore_cleanup_errors=True) as folder:
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
+        try:
+            yield
+        finally:
+            del os.environ["PROMETHEUS_MULTIPROC_DIR"]
 
 
 class Beats:

@@ -11,6 +11,9 @@ from types import ModuleType
 SCRIPTS = Path(__file__).parents[2] / "benchmarks"
 
 
+sys.path.append(str(SCRIPTS))  # they import each other
+
+
 @cache
 def load_script(name: str) -> ModuleType:
     """benchmarks/NAME.py, run once."""

@@ -24,8 +24,7 @@ SLOW = 16
 
 
 @pytest.fixture
-def web(monkeypatch: pytest.MonkeyPatch) -> Iterator[Web]:
-    monkeypatch.delenv("PROMETHEUS_MULTIPROC_DIR", raising=False)
+def web() -> Iterator[Web]:
     made = Web(("127.0.0.1", 0), ["robot"])
     metrics.beat("robot", time.time())
     metrics.CONDITION.labels("robot has a session").set(1)

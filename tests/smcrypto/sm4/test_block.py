@@ -50,6 +50,7 @@ def test_vectors_in_both_directions(v: SimpleNamespace) -> None:
     assert text == v.plaintext
 
 
+@pytest.mark.no_cover  # traced, it takes a minute
 @pytest.mark.parametrize("v", load("standards/sm4_block.json", iterations=1_000_000))
 def test_a_million_iterations(v: SimpleNamespace) -> None:
     cipher, text = sm4.SM4(v.key), v.plaintext

@@ -1,9 +1,8 @@
-"""A private network as the paper had it: geth nodes that sign blocks in turn by proof of authority (Clique, EIP-225).
+"""Private networks as the paper had them: geth nodes by proof of authority (Clique, EIP-225) or of work (ethash).
 
-Each node is its own process with its own keys, database and peers, on
-loopback. geth 1.13 is the last one that signs Clique blocks;
-`benchmarks/install_geth.sh` builds it. Used by the tests of the ledger on a
-real node and by chain_interaction.py.
+Each node is its own process with its own keys, database and peers, on loopback. geth 1.13 is the last one that signs
+Clique blocks, 1.10.26 the last that mines; `benchmarks/install_geth.sh` builds either. Used by the tests of the ledger
+on a real node, chain_interaction.py, load.py and paper.py.
 """
 
 from __future__ import annotations
@@ -24,23 +23,33 @@ from eth_account import Account
 from eth_keys.datatypes import PrivateKey
 
 CHAIN_ID, EPOCH, GAS_LIMIT = 4711, 30_000, 30_000_000
+DIFFICULTY = 0x4CCC8  # of the paper's network by proof of work
 PATIENCE = 60.0
+CONSENSUS = {"clique": ("GETH", "1.13."), "ethash": ("GETH_POW", "1.10.")}
+"""By each consensus, the variable of the environment that names the program, and its version."""
 _PASSWORD = "a node's own, on a machine that nobody else uses"
 
 
 class Unavailable(Exception):
-    """There is no geth that can sign Clique blocks."""
+    """There is no geth that can make such blocks."""
 
 
-def find_geth() -> str:
-    """The program named by GETH, or on PATH."""
-    program = os.environ.get("GETH") or shutil.which("geth")
+def find_geth(consensus: str = "clique") -> str:
+    """The program that the environment names, or the one on PATH."""
+    variable, version = CONSENSUS[consensus]
+    program = os.environ.get(variable) or shutil.which("geth")
     if not program or not Path(program).exists():
-        raise Unavailable("no geth 1.13 is installed: benchmarks/install_geth.sh builds it, GETH names it")
+        raise Unavailable(f"no geth {version}x is installed: benchmarks/install_geth.sh builds it, {variable} names it")
     said = subprocess.run([program, "version"], capture_output=True, text=True, check=True).stdout
-    if "Version: 1.13." not in said:
-        raise Unavailable(f"{program} is not geth 1.13, later ones cannot sign Clique blocks")
+    if f"Version: {version}" not in said:
+        raise Unavailable(f"{program} is not geth {version}x, which {consensus} takes; {variable} names another")
     return program
+
+
+def make_dag(folder: Path) -> None:
+    """The 1 GB of ethash's first epoch, without which nobody mines; made once, in minutes of a core."""
+    if not any(folder.glob("full-R23-*")):
+        subprocess.run([find_geth("ethash"), "makedag", "0", str(folder)], check=True, capture_output=True)
 
 
 def free_ports(count: int) -> list[int]:
@@ -58,25 +67,32 @@ def free_ports(count: int) -> list[int]:
     return found
 
 
-def genesis(signers: list[str], balances: Mapping[str, int], period: int) -> dict[str, Any]:
-    """The first block of a network with London's rules, where these may sign, one block every `period` seconds."""
+def genesis(signers: list[str], balances: Mapping[str, int], period: int, gas_limit: int) -> dict[str, Any]:
+    """The first block of a network with London's rules, where these may sign, one block every `period` seconds.
+
+    Without a period it is by proof of work, as difficult as the paper's.
+    """
     forks = ["homestead", "eip150", "eip155", "eip158", "byzantium", "constantinople", "petersburg", "istanbul",
              "berlin", "london"]
     between = "".join(address[2:].lower() for address in sorted(signers, key=str.lower))
+    engine = {"clique": {"period": period, "epoch": EPOCH}} if period else {"ethash": {}}
     return {
-        "config": {"chainId": CHAIN_ID, **{f"{fork}Block": 0 for fork in forks},
-                   "clique": {"period": period, "epoch": EPOCH}},
-        "difficulty": "1",
-        "gasLimit": hex(GAS_LIMIT),
-        "extraData": "0x" + "00" * 32 + between + "00" * 65,
+        "config": {"chainId": CHAIN_ID, **{f"{fork}Block": 0 for fork in forks}, **engine},
+        "difficulty": "1" if period else hex(DIFFICULTY),
+        "gasLimit": hex(gas_limit),
+        "extraData": "0x" + "00" * 32 + between + "00" * 65 if period else "0x",
         "alloc": {address: {"balance": hex(wei)} for address, wei in balances.items()},
     }
 
 
 class Node:
-    """One geth: a signer with its keys unlocked, as nobody may run it who has anything to lose."""
+    """One geth, with its keys unlocked, as nobody may run it who has anything to lose.
 
-    def __init__(self, program: str, folder: Path, signer: PrivateKey) -> None:
+    options: more of geth's command line. A value of None is a flag.
+    """
+
+    def __init__(self, program: str, folder: Path, signer: PrivateKey, options: Mapping[str, object]) -> None:
+        self._options = options
         self._program, self._folder, self._signer = program, folder, signer
         self.signer = signer.public_key.to_checksum_address()
         self.http_port, self._peer_port, self._engine_port = free_ports(3)
@@ -107,11 +123,12 @@ class Node:
             "http.port": self.http_port, "http.api": "eth,net,web3,admin,miner,debug", "unlock": self.signer,
             "password": self._folder / "password", "miner.etherbase": self.signer, "miner.gasprice": 1, "cache": 64,
             "verbosity": 3,
+            **dict.fromkeys(["nodiscover", "ipcdisable", "http", "allow-insecure-unlock", "txpool.nolocals"]),
+            **self._options,
         }
-        flags = ["nodiscover", "ipcdisable", "http", "allow-insecure-unlock", "mine", "txpool.nolocals"]
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
-                [self._program, *(f"--{flag}" for flag in flags), *(f"--{k}={v}" for k, v in options.items())],
+                [self._program, *(f"--{k}" if v is None else f"--{k}={v}" for k, v in options.items())],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )
         deadline = time.monotonic() + PATIENCE
@@ -150,13 +167,29 @@ class Node:
 
 
 class Network:
-    """`signers` nodes that know each other. With three of them, two make blocks without the third (EIP-225)."""
+    """Nodes that know each other. Of three Clique signers two make blocks without the third (EIP-225).
 
-    def __init__(self, folder: Path, balances: Mapping[str, int], *, signers: int = 3, period: int = 1) -> None:
-        program = find_geth()
-        keys = [PrivateKey(os.urandom(32)) for _ in range(signers)]
-        self.nodes = [Node(program, folder / f"node-{number}", key) for number, key in enumerate(keys)]
-        first_block = genesis([node.signer for node in self.nodes], balances, period)
+    period: seconds between blocks. dag: by proof of work instead, with the dataset in this folder (`make_dag`); the
+    first `miners` nodes mine with one thread each, the others follow.
+    """
+
+    def __init__(
+        self, folder: Path, balances: Mapping[str, int], *, nodes: int = 3, period: int = 1, gas_limit: int = GAS_LIMIT,
+        dag: Path | None = None, miners: int = 1,
+    ) -> None:  # fmt: skip
+        program = find_geth("clique" if dag is None else "ethash")
+        keys = [PrivateKey(os.urandom(32)) for _ in range(nodes)]
+        shared = {"miner.gaslimit": gas_limit}
+        signing = shared | {"mine": None}
+        mining = signing | {"miner.threads": 1, "ethash.dagdir": dag, "ethash.dagsinmem": 0, "ethash.dagsondisk": 1,
+                            "ethash.dagslockmmap": "false"}  # fmt: skip
+        roles = [signing if dag is None else mining if number < miners else shared for number in range(nodes)]
+        self.nodes = [
+            Node(program, folder / f"node-{number}", key, role)
+            for number, (key, role) in enumerate(zip(keys, roles, strict=True))
+        ]
+        period = period if dag is None else 0
+        first_block = genesis([node.signer for node in self.nodes], balances, period, gas_limit)
         try:
             for node in self.nodes:
                 node.init(first_block)
