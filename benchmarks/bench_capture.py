@@ -26,11 +26,11 @@ from rosbridge_eth.capture import (
     definition_line,
     parse_line,
 )
-from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
 
 
 def messages(topic: str) -> list[RawMessage]:
-    source = BagSource(BagSettings(sample_bag()), Selection([topic]))
+    source = BagSource(sample_bag(), Selection([topic]))
     return list(source.messages())
 
 
@@ -169,7 +169,7 @@ def test_replay_and_capture(benchmark: Any) -> None:
     """Open the bag, check its definitions, read, decode, capture."""
 
     def replay() -> int:
-        source = BagSource(BagSettings(sample_bag(), speed=None), Selection(["**"]))
+        source = BagSource(sample_bag(), Selection(["**"]), speed=None)
         capture = Capture([TopicRule("**")], source_kind=source.kind)
         records: list[bytes] = []
         source.run(lambda message: records.append(capture.process(message, 1).line), threading.Event())  # type: ignore[union-attr]

@@ -22,7 +22,7 @@ from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
 from rosbridge_eth.reading.verify import Verifier, is_signed
-from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
 START = datetime(2026, 1, 1, tzinfo=UTC)
@@ -32,7 +32,7 @@ LEDGER, NAME, ACCOUNT = b"L" * 32, "robot_1", "0x" + "00" * 20
 
 def sample_lines() -> tuple[list[bytes], list[bytes]]:
     """The lines that open a stream, and those of the sample's Odometry."""
-    source = BagSource(BagSettings(sample_bag()), Selection(["/robot_1/odom"]))
+    source = BagSource(sample_bag(), Selection(["/robot_1/odom"]))
     capture = Capture([TopicRule("/robot_1/odom")], source_kind="bag")
     captured = [found for raw in source.messages() if (found := capture.process(raw, T0_MS * 10**6, True))]
     opening = [stream_line("bag", "rosbridge_eth 2.0"), definition_line(captured[0].decoder)]

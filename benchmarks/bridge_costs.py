@@ -44,7 +44,7 @@ from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.robot import TAKE, Robot
 from rosbridge_eth.sender import Sender
 from rosbridge_eth.server import Reception, Worker
-from rosbridge_eth.sources import BagSettings, BagSource, Selection
+from rosbridge_eth.sources import BagSource, Selection
 from rosbridge_eth.sources.bag import sample_bag
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.writer import LogWriter
@@ -85,10 +85,10 @@ class Odometry:
     """A source of `count` messages: the sample bag's, again and again."""
 
     live, kind = False, "bag"
-    dropped: Mapping[str, int] = {}
+    lost: Mapping[tuple[str, str], int] = {}
 
     def __init__(self, count: int) -> None:
-        bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
+        bag = BagSource(sample_bag(), Selection([TOPIC]), speed=None)
         self.messages = list(bag.messages())
         bag.close()
         self.count = count

@@ -51,7 +51,7 @@ from rosbridge_eth.identity import Trust, load_identity
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.reading import Kind, ProvenRecord, Verdict, read_robot
 from rosbridge_eth.relay import Harm, Relay
-from rosbridge_eth.sources import BagSettings, BagSource, Selection
+from rosbridge_eth.sources import BagSource, Selection
 from rosbridge_eth.sources.bag import sample_bag
 from rosbridge_eth.supervisor import open_store
 
@@ -208,7 +208,7 @@ class Count:
 @cache
 def known() -> list[MessageLine]:
     """What the bag says, in order."""
-    bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
+    bag = BagSource(sample_bag(), Selection([TOPIC]), speed=None)
     capture = Capture([TopicRule(TOPIC)], source_kind="bag")
     try:
         lines = [parse_line(record.line) for raw in bag.messages() if (record := capture.process(raw, 0, True))]

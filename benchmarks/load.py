@@ -78,7 +78,7 @@ from rosbridge_eth.reading import Verifier
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.sender import Sender
 from rosbridge_eth.server import Worker
-from rosbridge_eth.sources import BagSettings, BagSource, Selection
+from rosbridge_eth.sources import BagSource, Selection
 from rosbridge_eth.sources.bag import sample_bag
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
@@ -383,7 +383,7 @@ def cpu_seconds(pids: Sequence[int]) -> float:
 @cache
 def captured(count: int) -> tuple[list[bytes], str, bytes]:
     """Lines of the sample bag's Odometry as capture writes them, their type, and its definition's line."""
-    bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
+    bag = BagSource(sample_bag(), Selection([TOPIC]), speed=None)
     capture, lines = Capture([TopicRule(TOPIC)], source_kind="bag"), list[bytes]()
     for raw in bag.messages():
         record = capture.process(raw, time.time_ns(), True)

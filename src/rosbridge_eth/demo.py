@@ -357,9 +357,9 @@ def demo(
 
 
 def _expected(bag: Path, topics: list[str]) -> int:
-    from rosbridge_eth.sources import BagSettings, BagSource, Selection
+    from rosbridge_eth.sources import BagSource, Selection
 
-    source = BagSource(BagSettings(bag), Selection(topics))
+    source = BagSource(bag, Selection(topics))
     try:
         return source.message_count
     finally:

@@ -358,7 +358,7 @@ def source(home: Path, secret: bytes | None) -> Findings:
 
     config = load_robot_config(RobotHome(home).config)
     settings, why = config.source_and_why(os.environ)
-    with closing(open_source(settings.settings(), config.selection())) as opened:
+    with closing(open_source(settings, config.selection())) as opened:
         offers = opened.offers()
     if settings.kind == "sim":
         yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")

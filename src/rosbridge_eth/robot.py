@@ -43,7 +43,7 @@ _T = TypeVar("_T")
 RING = 4096  # raw messages between the source's thread and the loop
 TAKE = 128  # raw messages captured before the network gets its turn again
 LONGEST_WAIT = 0.25
-LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source dropped
+LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
 SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
@@ -199,7 +199,7 @@ class Robot:
         return f"{raw.type_name} {changes}"
 
     def _add_losses(self, now: float) -> None:
-        for line in self.capture.lost(self.source.dropped):
+        for line in self.capture.lost(self.source.lost):
             self.writer.add(line, now)
 
     def _finish(self, now: float) -> None:
@@ -263,7 +263,7 @@ class Robot:
         left = spool.unstored + len(self._unspooled)
         topics = self.capture.statistics().values()
         lost = {
-            "messages dropped because they came too fast": sum(self.source.dropped.values()),
+            "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(t.refused + t.undecodable for t in topics),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
@@ -316,7 +316,7 @@ def open_robot(
     identity, roots = load_identity(home.identity, password)
     readers = reader_keys(config, home, roots)
     settings, _ = config.source_and_why(os.environ)
-    source = open_source(settings.settings(), config.selection())
+    source = open_source(settings, config.selection())
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
     for topic, decoders in source.decoders().items():
         for decoder in decoders:

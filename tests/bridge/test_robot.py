@@ -19,7 +19,7 @@ from rosbridge_eth.chunk import Log, drop, robot_id
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.sender import Sender
-from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.writer import LogWriter
 
@@ -34,10 +34,10 @@ class Source:
     kind, live = "bag", False
 
     def __init__(self, count: int) -> None:
-        bag = BagSource(BagSettings(sample_bag(), speed=None), Selection([TOPIC]))
+        bag = BagSource(sample_bag(), Selection([TOPIC]), speed=None)
         self.messages, self.count, self.emitted = list(bag.messages()), count, 0
         bag.close()
-        self.dropped: dict[str, int] = {}
+        self.lost: dict[tuple[str, str], int] = {}
 
     def run(self, emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
         while self.emitted < self.count and not stop.is_set():

@@ -38,10 +38,6 @@ class Cause(StrEnum):
     UNDECODABLE = "undecodable"
 
 
-DROPPED: Final = "dropped"
-"""Why a message is missing that a live source could not hand over in time."""
-
-
 class Captured(NamedTuple):
     """What became of a message: `line` is the record; data is JSON-ready, see conversion."""
 
@@ -145,12 +141,12 @@ class Capture:
         if state is not None:
             self._compile(state, decoder)
 
-    def lost(self, source_dropped: Mapping[str, int]) -> list[bytes]:
-        """The lines for what was refused here, and dropped by the source, since the last call.
+    def lost(self, source_lost: Mapping[tuple[str, str], int]) -> list[bytes]:
+        """The lines for what was refused here, and lost by the source, since the last call.
 
-        source_dropped: messages by topic since the source was opened, as `Source.dropped` has them.
+        source_lost: messages by topic and why since the source was opened, as `Source.lost` has them.
         """
-        so_far = {(topic, DROPPED): count for topic, count in source_dropped.items()}
+        so_far = dict(source_lost)
         for name, topic in self._topics.items():
             if topic is not None:
                 so_far |= {(name, str(cause)): topic.counts[cause] for cause in Cause if cause != Cause.FIELD_DIGESTED}

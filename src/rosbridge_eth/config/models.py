@@ -21,7 +21,7 @@ from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of
 
 if TYPE_CHECKING:
-    from rosbridge_eth.sources import Selection, SourceSettings
+    from rosbridge_eth.sources import Selection
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
 
@@ -183,12 +183,6 @@ class BagConfig(Section):
             raise ValueError("ends before it begins: `stop` is not after `start`")
         return self
 
-    def settings(self) -> SourceSettings:
-        """For sources.open_source."""
-        from rosbridge_eth.sources import BagSettings
-
-        return BagSettings(self.path, self.speed, self.start or 0, self.stop)
-
 
 class Ros1Config(Section):
     """A live ROS 1 master, with no ROS installed here (docs/howto-ros1.md).
@@ -213,12 +207,6 @@ class Ros1Config(Section):
     node: Ros1Node | None = None
     max_message: Annotated[int, size("1 KiB", "64 MiB")] = 32 * MIB
 
-    def settings(self) -> SourceSettings:
-        """For sources.open_source."""
-        from rosbridge_eth.sources.ros1 import Ros1Settings
-
-        return Ros1Settings(master=self.master, hostname=self.hostname, node=self.node, max_message=self.max_message)
-
 
 class Ros2Config(Section):
     """The live ROS 2 graph, through the rclpy of the Python that runs the robot.
@@ -236,12 +224,6 @@ class Ros2Config(Section):
     domain: Annotated[int, Field(ge=0, le=232)] | None = None
     node: Ros2Node = "rosbridge_eth"
     depth: int = Field(default=256, ge=1, le=65_536)
-
-    def settings(self) -> SourceSettings:
-        """For sources.open_source."""
-        from rosbridge_eth.sources.ros2 import Ros2Settings
-
-        return Ros2Settings(self.domain, self.node, self.depth)
 
 
 class SimConfig(Section):
@@ -267,12 +249,6 @@ class SimConfig(Section):
     rate: float = Field(default=10.0, gt=0, le=10_000)
     duration: DurationNs | None = None
     speed: Speed = 1.0
-
-    def settings(self) -> SourceSettings:
-        """For sources.open_source."""
-        from rosbridge_eth.sources import SimSettings
-
-        return SimSettings(self.robot, self.seed, self.rate, self.duration, self.speed)
 
 
 AnySource: TypeAlias = BagConfig | Ros1Config | Ros2Config | SimConfig

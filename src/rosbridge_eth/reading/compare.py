@@ -19,7 +19,7 @@ import numpy
 
 from rosbridge_eth.capture import MessageLine, RawMessage
 from rosbridge_eth.reading.verdict import shown
-from rosbridge_eth.sources import BagSettings, Selection, open_source
+from rosbridge_eth.sources import BagSource, Selection
 from smcrypto import sm3
 
 MAX_DIFFERENCES = 100
@@ -36,7 +36,7 @@ class Comparison:
 def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine]) -> Comparison:
     """Hold each record against the bag's own message: the same receive time, and each captured field equal."""
     expected: dict[str, list[RawMessage]] = defaultdict(list)
-    source = open_source(BagSettings(bag, speed=None), Selection(topics))
+    source = BagSource(bag, Selection(topics), speed=None)
     try:
         source.run(lambda raw: expected[raw.topic].append(raw), threading.Event())
     finally:

@@ -12,10 +12,8 @@ import logging
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import ClassVar
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Rosbag1Reader
@@ -23,8 +21,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 
 from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for, decoder_for_known, normalised_type_name
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
-from rosbridge_eth.sources.selection import Selection
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Selection, Source
 
 log = logging.getLogger(__name__)
 
@@ -33,54 +30,50 @@ MAX_WAIT_NS = 3600 * 10**9
 """A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
 
 
-@dataclass(frozen=True)
-class BagSettings:
-    """What of a bag is replayed, and how fast.
+class BagSource(Source):
+    """What of a bag is replayed, and how fast; it can be run again and then starts anew.
 
     speed: 1.0 is the recorded pace; None is as fast as messages are taken.
-    start_ns, stop_ns: replay [start, stop) of the recording, counted from its first message.
+    start, stop: replay [start, stop) of the recording, in ns from its first message.
     """
-
-    kind: ClassVar[str] = "bag"
-    path: Path
-    speed: float | None = 1.0
-    start_ns: int = 0
-    stop_ns: int | None = None
-
-
-class BagSource(Source):
-    """One bag; it can be run again and then starts anew."""
 
     kind = "bag"
     live = False
 
-    def __init__(self, settings: BagSettings, selection: Selection, clock: Clock | None = None) -> None:
+    def __init__(
+        self, path: Path, selection: Selection, clock: Clock | None = None, *,
+        speed: float | None = 1.0, start: int | None = None, stop: int | None = None,
+    ) -> None:  # fmt: skip
         """Opens the bag and resolves the selection. Raises SourceError."""
-        self._settings = settings
-        self._clock = clock or SystemClock()
-        self._where = f"bag {settings.path}"
-        self._wire = Wire.ROS1 if settings.path.suffix == ".bag" else Wire.CDR
+        self._speed, self._clock = speed, clock or Clock()
+        self._where = f"bag {path}"
+        self._wire = Wire.ROS1 if path.suffix == ".bag" else Wire.CDR
         self._reader: Rosbag1Reader | Rosbag2Reader | None = None
-        if not settings.path.exists():
+        if not path.exists():
             raise SourceError(f"{self._where} does not exist")
-        is_folder = settings.path.is_dir()
-        if is_folder and not (settings.path / "metadata.yaml").exists():
+        if path.is_dir() and not (path / "metadata.yaml").exists():
             raise SourceError(
                 f"{self._where} is a folder without metadata.yaml, so no ROS 2 bag; name {_BAGS}, or let"
                 " `ros2 bag reindex` restore a metadata.yaml that was lost"
             )
-        if not is_folder and settings.path.suffix not in (".bag", ".mcap", ".db3"):
+        if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
             raise SourceError(f"{self._where} is no bag by its name; name {_BAGS}")
         with self._translated():
-            reader = Rosbag1Reader(settings.path) if self._wire is Wire.ROS1 else Rosbag2Reader(settings.path)
+            reader = Rosbag1Reader(path) if self._wire is Wire.ROS1 else Rosbag2Reader(path)
             reader.open()
             self._reader = reader
-            self._connections = [
-                (connection, _offer_name(connection), normalised_type_name(connection.msgtype))
+            self._connections = [  # old recorders left the topic's leading slash out
+                (connection, f"/{connection.topic.removeprefix('/')}", normalised_type_name(connection.msgtype))
                 for connection in reader.connections
             ]
             self._distribution = reader.ros_distro if isinstance(reader, Rosbag2Reader) else None
-            self._start, self._end = reader.start_time, reader.end_time
+            begin, end = reader.start_time, reader.end_time
+        self._first, self._stop = begin + (start or 0), None if stop is None else begin + stop
+        self.span = (self._first, (end if self._stop is None else min(end, self._stop)) - 1)
+        """When the first and the last message can have been received that are replayed (ns since 1970).
+
+        The first is the later one where nothing is.
+        """
         try:
             self._offers = self._read_offers()
             watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
@@ -88,27 +81,13 @@ class BagSource(Source):
         except SourceError:
             self.close()
             raise
-        self._say_if_nothing_is_replayed()
-
-    def _say_if_nothing_is_replayed(self) -> None:
-        first, last = self.span
-        if self._end <= self._start:
+        if end <= begin:
             log.warning("%s holds no message", self._where)
-        elif first > last:
-            lasts = (self._end - 1 - self._start) / 1e9
+        elif self._first > self.span[1]:
             log.warning(
                 "%s: nothing is replayed: start = %gs is after its last message; the recording lasts %.3f s",
-                self._where, self._settings.start_ns / 1e9, lasts,
+                self._where, (start or 0) / 1e9, (end - 1 - begin) / 1e9,
             )
-
-    @property
-    def span(self) -> tuple[int, int]:
-        """When the first and the last message can have been received that are replayed (ns since 1970).
-
-        The first is the later one where nothing is.
-        """
-        stop = self._end if self._settings.stop_ns is None else min(self._end, self._start + self._settings.stop_ns)
-        return self._start + self._settings.start_ns, stop - 1
 
     def offers(self) -> Sequence[Offer]:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
@@ -131,29 +110,24 @@ class BagSource(Source):
         """The watched messages, in order, without waiting. Raises SourceError."""
         if self._reader is None:
             raise SourceError(f"{self._where} is closed")
-        first = self._start + self._settings.start_ns
-        stop = None if self._settings.stop_ns is None else self._start + self._settings.stop_ns
         topics = {connection.id: (topic, name) for connection, topic, name in self._connections}
         chosen = [connection for connection, _, _ in self._connections if connection.id in self._decoders]
         with self._translated():
-            for connection, received_ns, raw in self._reader.messages(chosen, first, stop):
-                topic, type_name = topics[connection.id]
-                yield RawMessage(topic, type_name, received_ns, bytes(raw), self._decoders[connection.id])
+            for connection, received_ns, raw in self._reader.messages(chosen, self._first, self._stop):
+                yield RawMessage(*topics[connection.id], received_ns, bytes(raw), self._decoders[connection.id])
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Replay at the set speed until the end or `stop`. Raises SourceError."""
-        speed, due, last = self._settings.speed, 0, None
+        due, last = self._clock.monotonic_ns(), None
         for message in self.messages():
-            if speed is not None:
-                if last is None:
-                    due = self._clock.monotonic_ns()
-                else:
-                    due += round(min(max(message.received_ns - last, 0), MAX_WAIT_NS) / speed)
-                last = message.received_ns
+            if self._speed is None:
+                if stop.is_set():
+                    return
+            else:
+                passed = 0 if last is None else min(max(message.received_ns - last, 0), MAX_WAIT_NS)
+                due, last = due + round(passed / self._speed), message.received_ns
                 if self._clock.wait_until(due, stop):
                     return
-            elif stop.is_set():
-                return
             emit(message)
 
     def close(self) -> None:
@@ -181,7 +155,7 @@ class BagSource(Source):
             try:
                 decoders[connection.id] = self._decoder(connection)
             except SourceError as error:
-                if selection.names(topic):
+                if topic in selection.named_topics:
                     raise
                 left_out = error
                 log.warning("%s; the topic is left out", error)
@@ -220,11 +194,6 @@ class BagSource(Source):
             detail = str(error).strip().rstrip(".").partition("\n")[0] or type(error).__name__
             mend = "; run `rosbag reindex` on it" if "not indexed" in detail else ""
             raise SourceError(f"{self._where} is damaged or not a bag: {detail}{mend}") from error
-
-
-def _offer_name(connection: Connection) -> str:
-    """The topic with its leading slash, which old recorders left out."""
-    return connection.topic if connection.topic.startswith("/") else f"/{connection.topic}"
 
 
 def sample_bag() -> Path:

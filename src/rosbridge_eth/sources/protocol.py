@@ -1,15 +1,21 @@
-"""What every kind of source is: something that offers topics and emits the messages of the chosen ones."""
+"""What every kind of source is: something that offers topics and emits the messages of the chosen ones.
+
+Chosen is by topic or by node, by name or by pattern. A node stands for the topics it publishes. Live sources choose
+again every few seconds, since nodes and topics come and go.
+"""
 
 from __future__ import annotations
 
+import difflib
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeAlias
 
-from rosbridge_eth.capture import Decoder, RawMessage
+from rosbridge_eth.capture import Decoder, NamePattern, RawMessage
+from rosbridge_eth.errors import SourceError
 
 Emit: TypeAlias = Callable[[RawMessage], None]
 """Takes a message; may block, which slows a bag or a simulation down (a live source drops instead)."""
@@ -44,8 +50,8 @@ class Source(Protocol):
         return {}
 
     @property
-    def dropped(self) -> Mapping[str, int]:
-        """Messages received but not emitted, `emit` being too slow, by topic; only a live source drops."""
+    def lost(self) -> Mapping[tuple[str, str], int]:
+        """Messages that were published and not emitted, by topic and why; only a live source loses any."""
         return {}
 
     @abstractmethod
@@ -56,28 +62,71 @@ class Source(Protocol):
         """Release files and sockets. May be called twice."""
 
 
-class Clock(Protocol):
-    """Time as a source sees it; passed in, so that tests need not wait."""
+class Clock:
+    """The machine's clocks, as a source sees time; passed in, so that tests need not wait."""
 
     def wall_ns(self) -> int:
         """Nanoseconds since 1970."""
-
-    def monotonic_ns(self) -> int:
-        """Nanoseconds since some start, never stepping."""
-
-    def wait_until(self, monotonic_ns: int, stop: threading.Event) -> bool:
-        """Wait until then or until `stop` is set; whether it is set."""
-
-
-class SystemClock:
-    """The machine's clocks."""
-
-    def wall_ns(self) -> int:
         return time.time_ns()
 
     def monotonic_ns(self) -> int:
+        """Nanoseconds since some start, never stepping."""
         return time.monotonic_ns()
 
     def wait_until(self, monotonic_ns: int, stop: threading.Event) -> bool:
-        remaining = monotonic_ns - time.monotonic_ns()
-        return stop.wait(remaining / 1e9) if remaining > 0 else stop.is_set()
+        """Wait until then or until `stop` is set; whether it is set."""
+        return stop.wait(max(0, monotonic_ns - time.monotonic_ns()) / 1e9)
+
+
+class Selection:
+    """Names and patterns of topics and of nodes; a topic is watched if any of them means it.
+
+    names_nodes: nodes are to be watched, so the source must know who publishes.
+    named_topics: those that are asked for by name, with their leading slash: known before anybody offers them.
+    """
+
+    def __init__(self, topics: Iterable[str] = (), nodes: Iterable[str] = ()) -> None:
+        """Raises ValueError with a sentence for a malformed pattern."""
+        self._topics = [NamePattern(topic) for topic in topics]
+        self._nodes = [NamePattern(node) for node in nodes]
+        self.names_nodes = bool(self._nodes)
+        self.named_topics = tuple(dict.fromkeys(pattern.text for pattern in self._topics if pattern.is_exact))
+
+    def wants(self, offer: Offer) -> bool:
+        """Whether a topic is watched."""
+        return any(pattern.matches(offer.topic) for pattern in self._topics) or any(
+            pattern.matches(node) for pattern in self._nodes for node in offer.nodes
+        )
+
+    def resolve(self, offers: Iterable[Offer]) -> tuple[Offer, ...]:
+        """The watched topics among those offered."""
+        return tuple(offer for offer in offers if self.wants(offer))
+
+    def unmatched(self, offers: Sequence[Offer]) -> tuple[str, ...]:
+        """The names and patterns that mean nothing of what is offered."""
+        nodes = {node for offer in offers for node in offer.nodes}
+        return (
+            *(p.text for p in self._topics if not any(p.matches(offer.topic) for offer in offers)),
+            *(p.text for p in self._nodes if not any(p.matches(node) for node in nodes)),
+        )
+
+    def resolve_all(self, offers: Sequence[Offer], where: str) -> tuple[Offer, ...]:
+        """As resolve, for a source that will not offer more: SourceError if a name means nothing of it.
+
+        A pattern may match nothing as long as something is watched.
+        """
+        chosen = self.resolve(offers)
+        exact = {pattern.text for pattern in (*self._topics, *self._nodes) if pattern.is_exact}
+        missing = [name for name in self.unmatched(offers) if name in exact or not chosen]
+        if not missing and chosen:
+            return chosen
+        nodes = sorted({node for offer in offers for node in offer.nodes})
+        near = difflib.get_close_matches(missing[0], [*(offer.topic for offer in offers), *nodes], 1) if missing else []
+        hint = f"did you mean {near[0]}? " if near else ""
+        topics = ", ".join(map(str, offers[:20])) or "no topics"
+        more = f" and {len(offers) - 20} more" if len(offers) > 20 else ""
+        raise SourceError(
+            f"{where} has no topic or node {', '.join(missing)}; {hint}"
+            f"It has {topics}{more}" + (f", published by {', '.join(nodes[:20])}" if nodes else "")
+            + ("" if nodes or not self.names_nodes else "; it does not say which nodes published: name topics")
+        )  # fmt: skip

@@ -11,12 +11,10 @@ import random
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from rosbridge_eth.capture import Decoder, RawMessage, Restoration, Wire, decoder_for_known
-from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
-from rosbridge_eth.sources.selection import Selection
+from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Selection, Source
 
 SPEED = 0.5
 """Metres per second along the path."""
@@ -29,18 +27,6 @@ GRAVITY = 9.80665
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
-
-
-@dataclass(frozen=True)
-class SimSettings:
-    """rate: of odometry and of IMU messages, Hz. duration_ns: None is endless. speed: as of a bag."""
-
-    kind: ClassVar[str] = "sim"
-    robot: str = "robot_1"
-    seed: int = 1
-    rate: float = 10.0
-    duration_ns: int | None = None
-    speed: float | None = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,22 +67,27 @@ def drive(seed: int, rate: float) -> Iterator[Motion]:
 
 
 class SimSource(Source):
-    """The simulated robot as a source: `/NAME/odom` and `/NAME/imu`, published by the node `/NAME/sim`."""
+    """The simulated robot as a source: `/NAME/odom` and `/NAME/imu`, published by the node `/NAME/sim`.
+
+    rate: of odometry and of IMU messages, Hz. duration: ns; None is endless. speed: as of a bag.
+    """
 
     kind = "sim"
     live = False
 
-    def __init__(self, settings: SimSettings, selection: Selection, clock: Clock | None = None) -> None:
+    def __init__(
+        self, selection: Selection, clock: Clock | None = None, *,
+        robot: str = "robot_1", seed: int = 1, rate: float = 10.0, duration: int | None = None,
+        speed: float | None = 1.0,
+    ) -> None:  # fmt: skip
         """Raises SourceError if the selection names what the robot does not have."""
-        self._settings = settings
-        self._clock = clock or SystemClock()
-        node = f"/{settings.robot}/sim"
-        self._offers = (
-            Offer(f"/{settings.robot}/imu", IMU, (node,)),
-            Offer(f"/{settings.robot}/odom", ODOMETRY, (node,)),
-        )
+        self._robot, self._seed, self._rate, self._duration, self._speed = robot, seed, rate, duration, speed
+        self._clock = clock or Clock()
+        nodes = (f"/{robot}/sim",)
+        self._offers = (Offer(f"/{robot}/imu", IMU, nodes), Offer(f"/{robot}/odom", ODOMETRY, nodes))
         chosen = selection.resolve_all(self._offers, "the simulated robot")
-        self._watched = {offer.topic: _restoration(offer.type_name) for offer in chosen}
+        known = ((offer, decoder_for_known(Wire.ROS1, offer.type_name)) for offer in chosen)
+        self._watched = [(offer, Restoration(decoder)) for offer, decoder in known if decoder is not None]
 
     def offers(self) -> Sequence[Offer]:
         """Odometry and IMU."""
@@ -104,39 +95,29 @@ class SimSource(Source):
 
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration beforehand."""
-        return {topic: [restoration.decoder] for topic, restoration in self._watched.items()}
+        return {offer.topic: [restoration.decoder] for offer, restoration in self._watched}
 
     def messages(self, start_ns: int) -> Iterator[RawMessage]:
         """The watched messages from a start time on, without waiting."""
-        period = 1e9 / self._settings.rate
-        for tick, motion in enumerate(drive(self._settings.seed, self._settings.rate)):
-            passed = round(tick * period)
-            if self._settings.duration_ns is not None and passed >= self._settings.duration_ns:
+        for tick, motion in enumerate(drive(self._seed, self._rate)):
+            passed = round(tick * 1e9 / self._rate)
+            if self._duration is not None and passed >= self._duration:
                 return
-            for offer in self._offers:
-                if restoration := self._watched.get(offer.topic):
-                    at, decoder = start_ns + passed, restoration.decoder
-                    data = _CONTENT[offer.type_name](self._settings.robot, tick, at, motion)
-                    raw = decoder.encode(restoration.restore(data).message)
-                    yield RawMessage(offer.topic, offer.type_name, at, raw, decoder)
+            for offer, restoration in self._watched:
+                data = _CONTENT[offer.type_name](self._robot, tick, start_ns + passed, motion)
+                raw = restoration.decoder.encode(restoration.restore(data).message)
+                yield RawMessage(offer.topic, offer.type_name, start_ns + passed, raw, restoration.decoder)
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Publish at the set speed until the duration is over or `stop` is set."""
-        wall, monotonic, speed = self._clock.wall_ns(), self._clock.monotonic_ns(), self._settings.speed
+        wall, monotonic = self._clock.wall_ns(), self._clock.monotonic_ns()
         for message in self.messages(wall):
-            if speed is None:
+            if self._speed is None:
                 if stop.is_set():
                     return
-            elif self._clock.wait_until(monotonic + round((message.received_ns - wall) / speed), stop):
+            elif self._clock.wait_until(monotonic + round((message.received_ns - wall) / self._speed), stop):
                 return
             emit(message)
-
-
-def _restoration(type_name: str) -> Restoration:
-    decoder = decoder_for_known(Wire.ROS1, type_name)
-    if decoder is None:
-        raise SourceError(f"this version of rosbags does not know {type_name}")
-    return Restoration(decoder)
 
 
 def _odometry(robot: str, tick: int, stamp_ns: int, motion: Motion) -> dict[str, Any]:

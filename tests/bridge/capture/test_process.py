@@ -102,14 +102,14 @@ def test_what_is_not_in_the_log_is_declared_once():
     for tick in range(3):
         capture.process(number(tick), 0)  # nor is what is not due
     capture.process(RawMessage("/n", "pkg/msg/Number", 10**12, b"", NUMBER), 0)
-    lost = [parse_line(line) for line in capture.lost({"/b": 5, "/quiet": 0})]
+    lost = [parse_line(line) for line in capture.lost({("/b", "dropped"): 5, ("/quiet", "lost"): 0})]
     assert sorted(lost, key=lambda line: line.lost) == [
         LostLine(1, "/n", "undecodable"), LostLine(2, "/b", "field_too_large"), LostLine(5, "/b", "dropped"),
     ]  # fmt: skip
-    assert capture.lost({"/b": 5}) == []
+    assert capture.lost({("/b", "dropped"): 5}) == []
     capture.process(blob(2000), 0)
-    assert capture.lost({"/b": 6, "/c": 1}) == [
-        b'{"lost":1,"topic":"/b","why":"dropped"}', b'{"lost":1,"topic":"/c","why":"dropped"}',
+    assert capture.lost({("/b", "dropped"): 6, ("/c", "lost"): 1}) == [
+        b'{"lost":1,"topic":"/b","why":"dropped"}', b'{"lost":1,"topic":"/c","why":"lost"}',
         b'{"lost":1,"topic":"/b","why":"field_too_large"}',
     ]  # fmt: skip
 

@@ -7,7 +7,9 @@ import threading
 import pytest
 
 from rosbridge_eth.capture import RawMessage, Wire, decoder_for
-from rosbridge_eth.sources.backlog import OVERHEAD, Backlog
+from rosbridge_eth.errors import SourceError
+from rosbridge_eth.sources import Selection
+from rosbridge_eth.sources.live import OVERHEAD, Backlog, LiveSource
 
 DECODER = decoder_for(Wire.CDR, "std_msgs/msg/String", "string data")
 
@@ -92,3 +94,29 @@ def test_closing_ends_a_wait_and_keeps_what_was_received():
     assert [taken and taken.received_ns for taken in found] == [1, None]
     backlog.put(message("/a", 2))
     assert drain(backlog) == []
+
+
+class Quick(LiveSource):
+    """A graph that publishes ten messages at once, and knows of others that did not come through."""
+
+    kind = "ros2"
+
+    def offers(self):
+        return ()
+
+    def _receive(self):
+        for number in range(10):
+            self._backlog.put(message("/a", number))
+        self.counts["/a", "received"] += 10
+        self.counts["/a", "lost"] += 3
+        self.counts["/b", "foreign"] += 1
+        self.counts["/b", "connected"] += 1
+
+
+def test_what_a_live_source_loses_is_told_by_topic_and_why():
+    source, emitted = Quick(Selection(["**"]), None, 4, 1 << 20), []
+    source.run(emitted.append, threading.Event())
+    assert [raw.received_ns for raw in emitted] == [6, 7, 8, 9], "it ends when its graph has, and nothing waits"
+    assert source.lost == {("/a", "dropped"): 6, ("/a", "lost"): 3, ("/b", "foreign"): 1}
+    with pytest.raises(SourceError, match="runs once"):
+        source.run(emitted.append, threading.Event())

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection
+from rosbridge_eth.sources import BagSource, Offer, Selection
 
 S = 10**9
 START = 1_700_000_000 * S
@@ -115,7 +115,7 @@ def bag(request, tmp_path: Path) -> Path:
 
 
 def replayed(path: Path, *topics: str, **settings) -> list[RawMessage]:
-    source = BagSource(BagSettings(path, speed=MAX_SPEED, **settings), Selection(topics))
+    source = BagSource(path, Selection(topics), speed=MAX_SPEED, **settings)
     emitted: list[RawMessage] = []
     source.run(emitted.append, threading.Event())
     source.close()
@@ -141,14 +141,14 @@ def test_a_selection_is_all_that_is_read(bag):
 
 
 def test_a_part_of_the_recording_is_replayed(bag):
-    messages = replayed(bag, "/custom", start_ns=S, stop_ns=3 * S)
+    messages = replayed(bag, "/custom", start=S, stop=3 * S)
     assert [message.received_ns - START for message in messages] == [S, 2 * S]
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(1.0, 4.5), (2.0, 2.25), (0.5, 9.0)])
 def test_the_pace_is_the_recorded_one_times_the_speed(bag, speed, seconds):
     clock = FakeClock()
-    source = BagSource(BagSettings(bag, speed=speed), Selection(["**"]), clock)
+    source = BagSource(bag, Selection(["**"]), clock, speed=speed)
     at = []
     source.run(lambda _: at.append(clock.now / S), threading.Event())
     assert at == pytest.approx([tick * 0.5 / speed for tick in range(10)])
@@ -158,7 +158,7 @@ def test_the_pace_is_the_recorded_one_times_the_speed(bag, speed, seconds):
 def test_a_replay_stops_when_told(bag):
     for speed in (1.0, None):
         clock, stop, emitted = FakeClock(), threading.Event(), []
-        source = BagSource(BagSettings(bag, speed=speed), Selection(["**"]), clock)
+        source = BagSource(bag, Selection(["**"]), clock, speed=speed)
 
         def emit(message, emitted=emitted, stop=stop):
             emitted.append(message)
@@ -173,7 +173,7 @@ def test_a_replay_stops_when_told(bag):
 
 
 def test_what_a_bag_offers(bag):
-    source = BagSource(BagSettings(bag), Selection(["**"]))
+    source = BagSource(bag, Selection(["**"]))
     nodes = (("/camera",), ("/talker",)) if bag.suffix == ".bag" else ((), ())
     assert source.offers() == (
         Offer("/custom", "my_pkg/msg/Custom", nodes[0]),
@@ -190,21 +190,21 @@ def test_what_a_bag_offers(bag):
 def test_a_node_means_what_it_publishes(tmp_path):
     path = tmp_path / "some.bag"
     write_ros1(path)
-    source = BagSource(BagSettings(path, speed=None), Selection(nodes=["/cam*"]))
+    source = BagSource(path, Selection(nodes=["/cam*"]), speed=None)
     assert {message.topic for message in source.messages()} == {"/custom"}
     folder = tmp_path / "folder"
     write_ros2(folder, StoragePlugin.MCAP)
     with pytest.raises(SourceError, match="does not say which nodes published: name topics"):
-        BagSource(BagSettings(folder), Selection(nodes=["/camera"]))
+        BagSource(folder, Selection(nodes=["/camera"]))
 
 
 def test_a_name_that_is_not_there_is_told_with_what_is(bag):
     with pytest.raises(
         SourceError, match=r"no topic or node /nmes; did you mean /names\?.*/custom \(my_pkg/msg/Custom"
     ):
-        BagSource(BagSettings(bag), Selection(["/custom", "/nmes"]))
+        BagSource(bag, Selection(["/custom", "/nmes"]))
     with pytest.raises(SourceError, match=r"no topic or node /robot/\*\*"):
-        BagSource(BagSettings(bag), Selection(["/robot/**"]))
+        BagSource(bag, Selection(["/robot/**"]))
     # A pattern that means nothing is no error as long as something is watched.
     assert len(replayed(bag, "/custom", "/robot/**")) == 5
 
@@ -246,20 +246,20 @@ def test_what_is_not_a_bag_is_a_sentence(tmp_path):
         file = tmp_path / name
         file.write_bytes(content)
         with pytest.raises(SourceError, match=r"is damaged or not a bag: \S"):
-            BagSource(BagSettings(file), Selection(["**"]))
+            BagSource(file, Selection(["**"]))
     with pytest.raises(SourceError, match="does not exist"):
-        BagSource(BagSettings(tmp_path / "nowhere.bag"), Selection(["**"]))
+        BagSource(tmp_path / "nowhere.bag", Selection(["**"]))
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information: [1, 2")
     with pytest.raises(SourceError, match="is damaged or not a bag"):
-        BagSource(BagSettings(tmp_path / "folder"), Selection(["**"]))
+        BagSource(tmp_path / "folder", Selection(["**"]))
 
 
 def attempt(path: Path) -> int:
     """How many messages a damaged bag gives before the SourceError; anything else fails the test."""
     emitted: list[RawMessage] = []
     try:
-        source = BagSource(BagSettings(path, speed=None), Selection(["**"]))
+        source = BagSource(path, Selection(["**"]), speed=None)
         try:
             source.run(emitted.append, threading.Event())
         finally:
@@ -282,7 +282,7 @@ def test_a_truncated_bag_is_a_source_error_at_every_length(bag):
     if bag.suffix == ".bag":
         file.write_bytes(content[: len(content) // 2])
         with pytest.raises(SourceError):
-            BagSource(BagSettings(bag), Selection(["**"]))
+            BagSource(bag, Selection(["**"]))
 
 
 def test_a_bag_with_flipped_bytes_gives_messages_or_a_source_error(bag):
@@ -301,7 +301,7 @@ def test_a_recording_that_was_cut_off_names_the_mend(tmp_path):
     content[at : at + 8] = bytes(8)  # what a recorder leaves that did not come to write the index
     path.write_bytes(content)
     with pytest.raises(SourceError, match="rosbag reindex"):
-        BagSource(BagSettings(path), Selection(["**"]))
+        BagSource(path, Selection(["**"]))
 
 
 def test_a_hostile_definition_in_a_bag_is_refused_with_its_topic(tmp_path, caplog):
@@ -311,7 +311,7 @@ def test_a_hostile_definition_in_a_bag_is_refused_with_its_topic(tmp_path, caplo
     path.write_bytes(content.replace(b"bool ok", b"bool o'"))
     for selection in (Selection(["/custom"]), Selection(["/cust*"]), Selection(nodes=["/camera"])):
         with pytest.raises(SourceError, match=r"topic /custom: a line .* is not a field"):
-            BagSource(BagSettings(path), selection)
+            BagSource(path, selection)
     # Other topics are not affected, and a pattern that means it among others says so and goes on.
     assert len(replayed(path, "/names")) == 5
     caplog.clear()
@@ -340,4 +340,4 @@ def test_what_is_no_bag_is_told_with_what_a_bag_is(tmp_path, name, says):
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.md").write_text("no bag")
     with pytest.raises(SourceError, match=f"{says}.*name a .bag, .mcap or .db3 file or the folder"):
-        BagSource(BagSettings(tmp_path / name), Selection(("/**",)))
+        BagSource(tmp_path / name, Selection(("/**",)))

@@ -12,12 +12,12 @@ from rosbags.rosbag1 import Reader
 
 from bridge.sources.values import value_at
 from rosbridge_eth.capture import Capture, TopicRule
-from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, sample_bag
+from rosbridge_eth.sources import BagSource, Offer, Selection, sample_bag
 
 
 def records(topic: str):
     capture = Capture([TopicRule(topic)], source_kind=BagSource.kind)
-    source = BagSource(BagSettings(sample_bag()), Selection([topic]))
+    source = BagSource(sample_bag(), Selection([topic]))
     return [capture.process(message, 0) for message in source.messages()]
 
 
@@ -44,7 +44,7 @@ def test_rosbag_itself_agrees(require):
 
 
 def test_the_publisher_s_node_is_known():
-    source = BagSource(BagSettings(sample_bag()), Selection(nodes=["/robot_1/base"]))
+    source = BagSource(sample_bag(), Selection(nodes=["/robot_1/base"]))
     assert source.offers() == (
         Offer("/robot_1/imu", "sensor_msgs/msg/Imu", ("/robot_1/base",)),
         Offer("/robot_1/odom", "nav_msgs/msg/Odometry", ("/robot_1/base",)),

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-import types
-from dataclasses import dataclass
-from typing import ClassVar
+import inspect
+import threading
 
 import pytest
 
+from rosbridge_eth.config.models import SOURCE_KINDS, SimConfig
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import KINDS, Offer, Selection, SimSettings, SimSource, open_source
+from rosbridge_eth.sources import _KINDS, Offer, Selection, open_source
 
 ODOM = Offer("/robot_1/odom", "nav_msgs/msg/Odometry", ("/robot_1/base",))
 IMU = Offer("/robot_1/imu", "sensor_msgs/msg/Imu", ("/robot_1/base", "/robot_1/imu_driver"))
@@ -44,19 +43,14 @@ def test_what_means_nothing_is_known():
         selection.resolve_all(OFFERS, "here")
 
 
-@dataclass(frozen=True)
-class OtherSettings:
-    kind: ClassVar[str] = "other"
+@pytest.mark.parametrize("kind", SOURCE_KINDS)
+def test_every_key_of_a_table_is_taken_by_its_source(kind):
+    parameters = inspect.signature(_KINDS[kind]).parameters
+    assert SOURCE_KINDS[kind].model_fields.keys() - {"kind"} <= parameters.keys()
 
 
-def test_kinds_are_found_by_name_and_may_be_added(monkeypatch):
-    assert isinstance(open_source(SimSettings(), Selection(["**"])), SimSource)
-    with pytest.raises(SourceError, match="no source of kind 'other'; there are bag, ros1, ros2, sim"):
-        open_source(OtherSettings(), Selection(["**"]))
-    monkeypatch.setitem(KINDS, "other", "a_module_of_nobody:Source")
-    with pytest.raises(SourceError, match="needs a_module_of_nobody, which is not installed"):
-        open_source(OtherSettings(), Selection(["**"]))
-    module = types.ModuleType("a_module_of_nobody")
-    module.Source = lambda settings, selection, clock: (settings, selection, clock)
-    monkeypatch.setitem(sys.modules, "a_module_of_nobody", module)
-    assert open_source(OtherSettings(), Selection())[0] == OtherSettings()
+def test_what_the_table_says_is_opened():
+    source = open_source(SimConfig(kind="sim", robot="bot", duration="1s", speed="max"), Selection(["**"]))
+    received = []
+    source.run(received.append, threading.Event())
+    assert [raw.topic for raw in received] == ["/bot/imu", "/bot/odom"] * 10

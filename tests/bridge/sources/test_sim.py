@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from bridge.sources.values import value_at
 from rosbridge_eth.capture import Capture, TopicRule, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import Selection, SimSettings, SimSource
+from rosbridge_eth.sources import Selection, SimSource
 from rosbridge_eth.sources.sim import RADIUS, SPEED, Motion, advance, drive
 
 S = 10**9
@@ -75,7 +75,7 @@ def test_the_drive_is_a_figure_eight_and_depends_on_the_seed_alone():
 
 def test_messages_are_odometry_and_imu_that_capture_understands():
     clock = FakeClock()
-    source = SimSource(SimSettings(rate=10, duration_ns=3 * S), Selection(["**"]), clock)
+    source = SimSource(Selection(["**"]), clock, rate=10, duration=3 * S)
     emitted = []
     source.run(emitted.append, threading.Event())
     assert len(emitted) == 60
@@ -99,7 +99,7 @@ def test_messages_are_odometry_and_imu_that_capture_understands():
 @pytest.mark.parametrize(("speed", "passed"), [(1.0, 2.9), (10.0, 0.29), (None, 0)])
 def test_the_pace(speed, passed):
     clock = FakeClock()
-    source = SimSource(SimSettings(rate=10, duration_ns=3 * S, speed=speed), Selection(["/robot_1/odom"]), clock)
+    source = SimSource(Selection(["/robot_1/odom"]), clock, rate=10, duration=3 * S, speed=speed)
     emitted = []
     source.run(emitted.append, threading.Event())
     assert (clock.now - 5 * S) / S == pytest.approx(passed)
@@ -109,7 +109,7 @@ def test_the_pace(speed, passed):
 def test_it_stops_when_told_and_refuses_what_it_does_not_have():
     for speed in (1.0, None):
         stop, emitted = threading.Event(), []
-        source = SimSource(SimSettings(speed=speed), Selection(nodes=["/robot_1/sim"]), FakeClock())
+        source = SimSource(Selection(nodes=["/robot_1/sim"]), FakeClock(), speed=speed)
 
         def emit(message, emitted=emitted, stop=stop):
             emitted.append(message)
@@ -119,6 +119,6 @@ def test_it_stops_when_told_and_refuses_what_it_does_not_have():
         source.run(emit, stop)
         assert len(emitted) == 5
     with pytest.raises(SourceError, match="the simulated robot has no topic or node /robot_2/odom; did you mean"):
-        SimSource(SimSettings(), Selection(["/robot_2/odom"]))
+        SimSource(Selection(["/robot_2/odom"]))
     with pytest.raises(SourceError, match="/bot/odom"):
-        SimSource(SimSettings(robot="bot"), Selection(["/robot_1/odom"]))
+        SimSource(Selection(["/robot_1/odom"]), robot="bot")

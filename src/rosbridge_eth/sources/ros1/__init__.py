@@ -4,14 +4,12 @@
     api         calls of the master's and the publishers' APIs, and our own: bounded XML-RPC over HTTP
     tcpros      a publisher's connection: header, type and decoder, messages
     publisher   one thread for each publisher: connect, read, try again
-    node        what is registered, and whom we are connected to
-    source      the Source
+    source      the Source: what is registered, and whom we are connected to
 
 ROS 1 has no authentication: whoever reaches the network can publish. What is promised is that no publisher, master or
 caller of our API can make the bridge crash, wait, or use more memory than was set.
 """
 
-from rosbridge_eth.sources.ros1.publisher import Cause
-from rosbridge_eth.sources.ros1.source import Ros1Settings, Ros1Source
+from rosbridge_eth.sources.ros1.source import Ros1Source
 
-__all__ = ["Cause", "Ros1Settings", "Ros1Source"]
+__all__ = ["Ros1Source"]

@@ -15,9 +15,9 @@ import os
 import re
 import socket
 from collections.abc import Mapping
-from typing import NamedTuple
 from urllib.parse import urlsplit
 
+from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
 
 MASTER_PORT = 11311
@@ -31,18 +31,8 @@ class ProtocolError(SourceError):
     """The peer sent what TCPROS or XML-RPC does not allow, or more than is read. Its connection is closed."""
 
 
-class Endpoint(NamedTuple):
-    """What a ROS API's URI or a TCPROS answer names. `host` has no brackets."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
-
-
-def read_uri(text: str, default_port: int | None = None) -> Endpoint:
-    """The endpoint of an XML-RPC URI. Raises ProtocolError."""
+def read_uri(text: str, default_port: int | None = None) -> Address:
+    """The address in an XML-RPC URI. Raises ProtocolError."""
     try:
         parts = urlsplit(text if len(text) <= MAX_URI else "")
         host, port = parts.hostname or "", parts.port or default_port
@@ -50,21 +40,16 @@ def read_uri(text: str, default_port: int | None = None) -> Endpoint:
         raise ProtocolError(f"{text[:60]!r} is not a ROS URI") from None
     if parts.scheme != "http" or port is None:
         raise ProtocolError(f"{text[:60]!r} is not a ROS URI, such as http://192.0.2.7:11311/")
-    return read_endpoint(host, port)
+    return read_address(host, port)
 
 
-def read_endpoint(host: object, port: object) -> Endpoint:
+def read_address(host: object, port: object) -> Address:
     """Host and port as a publisher gave them. Raises ProtocolError."""
-    if not isinstance(host, str) or not is_host(host):
+    if not isinstance(host, str) or not _HOST.fullmatch(host):
         raise ProtocolError(f"{str(host)[:60]!r} is not a host")
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 65536:
+    if type(port) is not int or not 0 < port < 65536:
         raise ProtocolError(f"{str(port)[:60]!r} is not a port")
-    return Endpoint(host, port)
-
-
-def is_host(text: object) -> bool:
-    """Whether this can be a host's name or address."""
-    return isinstance(text, str) and _HOST.fullmatch(text) is not None
+    return Address(host, port)
 
 
 def is_graph_name(name: object) -> bool:
@@ -72,7 +57,7 @@ def is_graph_name(name: object) -> bool:
     return isinstance(name, str) and _GRAPH_NAME.fullmatch(name) is not None
 
 
-def master_endpoint(configured: str | None, environment: Mapping[str, str] = os.environ) -> Endpoint:
+def master_address(configured: str | None, environment: Mapping[str, str] = os.environ) -> Address:
     """The master. Raises SourceError that says where the wrong value stands."""
     text = configured or environment.get("ROS_MASTER_URI") or f"http://localhost:{MASTER_PORT}"
     try:
@@ -82,14 +67,14 @@ def master_endpoint(configured: str | None, environment: Mapping[str, str] = os.
         raise SourceError(f"{where} is wrong: {error}") from None
 
 
-def own_host(configured: str | None, master: Endpoint, environment: Mapping[str, str] = os.environ) -> str | None:
+def own_host(configured: str | None, master: Address, environment: Mapping[str, str] = os.environ) -> str | None:
     """The name or address that we tell the master. Raises SourceError; may ask the resolver.
 
     None: there is no route to the master, or its name does not resolve, as on a robot whose network is not up yet.
     """
     text = configured or environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
     if text:
-        if not is_host(text):
+        if not _HOST.fullmatch(text):
             raise SourceError(f"{text!r} (`hostname` of [source], ROS_HOSTNAME or ROS_IP) is not a name or address")
         return text
     try:
@@ -104,20 +89,13 @@ def own_host(configured: str | None, master: Endpoint, environment: Mapping[str,
 
 def bind_host(host: str) -> str:
     """Where our server listens: on loopback alone if that is what we tell the master, otherwise everywhere."""
-    if host == "localhost":
-        return "127.0.0.1"
     try:
-        address = ipaddress.ip_address(host)
+        address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError:
         return "0.0.0.0"  # noqa: S104 - a name may stand for any of our addresses
     if address.is_loopback:
-        return host
+        return str(address)
     return "::" if address.version == 6 else "0.0.0.0"  # noqa: S104 - as rospy: the master may be on any side
-
-
-def uri_of(host: str, port: int) -> str:
-    """Our API's URI for the master."""
-    return f"http://{Endpoint(host, port)}/"
 
 
 def node_name(configured: str | None) -> str:

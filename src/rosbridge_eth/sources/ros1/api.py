@@ -20,9 +20,10 @@ from typing import Any, Final
 from xml.parsers.expat import ExpatError
 
 from rosbridge_eth.capture import DefinitionError, normalised_type_name
+from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.protocol import Offer
-from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError, is_graph_name, read_endpoint
+from rosbridge_eth.sources.ros1.addressing import ProtocolError, is_graph_name, read_address
 
 MASTER_ANSWER: Final = 4 << 20
 """Bytes of a master's answer; the state of a thousand topics and nodes has a few hundred thousand."""
@@ -96,14 +97,12 @@ def why(error: BaseException) -> str:
     return (error.strerror or "the connection failed").lower() if isinstance(error, OSError) else str(error)
 
 
-def call(
-    endpoint: Endpoint, deadlines: Deadlines, timeout: float, limit: int, method: str, *parameters: Any
-) -> Any:
+def call(address: Address, deadlines: Deadlines, timeout: float, limit: int, method: str, *parameters: Any) -> Any:
     """The value of a successful answer. Raises Refusal, ProtocolError, or OSError if there is none in time.
 
     timeout: seconds to connect, and then for the call.
     """
-    connection = http.client.HTTPConnection(*endpoint, timeout=timeout)
+    connection = http.client.HTTPConnection(*address, timeout=timeout)
     try:
         connection.connect()
         with deadlines.within(connection.sock, timeout):
@@ -145,38 +144,24 @@ def read_document(body: bytes) -> tuple[Sequence[Any], str | None]:
         raise ProtocolError(f"this is not XML-RPC: {str(error)[:100]}") from None
 
 
-class Server:
+class Server(ThreadingHTTPServer):
     """Our own API: every call goes to `answer(method, parameters)`, which raises KeyError for a method it has not."""
 
-    def __init__(self, host: str, answer: Callable[[str, Sequence[Any]], Any], timeout: float) -> None:
-        """Raises OSError."""
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                _serve(self, answer)
-
-            def log_message(self, *_: object) -> None:
-                """Nothing: whoever calls may do so as often as he likes."""
-
-        Handler.timeout = timeout
-        self._server = _Listener(host, Handler)
-        self.port = self._server.server_address[1]
-        threading.Thread(target=self._server.serve_forever, args=(_LOOK_EVERY,), name="ros1 api", daemon=True).start()
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Listener(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     request_queue_size = 128
 
-    def __init__(self, host: str, handler: type[BaseHTTPRequestHandler]) -> None:
+    def __init__(self, host: str, answer: Callable[[str, Sequence[Any]], Any], timeout: float) -> None:
+        """Raises OSError."""
+        self.answer, self._patience = answer, timeout
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._callers: deque[socket.socket] = deque()
-        super().__init__((host, 0), handler)
+        super().__init__((host, 0), _Call)
+        threading.Thread(target=self.serve_forever, args=(_LOOK_EVERY,), name="ros1 api", daemon=True).start()
+
+    def close(self) -> None:
+        self.shutdown()
+        self.server_close()
 
     def server_bind(self) -> None:
         """Without asking a name server for our own name."""
@@ -184,6 +169,7 @@ class _Listener(ThreadingHTTPServer):
         self.server_address = self.socket.getsockname()
 
     def process_request(self, request: Any, client_address: Any) -> None:
+        request.settimeout(self._patience)
         self._callers = deque(known for known in self._callers if known.fileno() >= 0)
         if len(self._callers) >= MAX_CALLERS:
             hang_up(self._callers.popleft())
@@ -194,24 +180,30 @@ class _Listener(ThreadingHTTPServer):
         """Nothing: the caller has gone, or was sent away."""
 
 
-def _serve(request: BaseHTTPRequestHandler, answer: Callable[[str, Sequence[Any]], Any]) -> None:
-    length = request.headers.get("Content-Length", "")
-    if not (length.isascii() and length.isdecimal() and len(length) < 9 and int(length) <= PEER_BODY):
-        request.send_error(400)
-        return
-    try:
-        parameters, method = read_document(request.rfile.read(int(length)))
-        body = xmlrpc.client.dumps((answer(method or "", parameters),), methodresponse=True)
-    except KeyError:
-        body = xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no such method"), methodresponse=True)
-    except (ProtocolError, xmlrpc.client.Fault):
-        request.send_error(400)
-        return
-    request.send_response(200)
-    request.send_header("Content-Type", "text/xml")
-    request.send_header("Content-Length", str(len(body.encode())))
-    request.end_headers()
-    request.wfile.write(body.encode())
+class _Call(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdecimal() and len(length) < 9 and int(length) <= PEER_BODY):
+            self.send_error(400)
+            return
+        try:
+            parameters, method = read_document(self.rfile.read(int(length)))
+            text = xmlrpc.client.dumps((self.server.answer(method or "", parameters),), methodresponse=True)
+        except KeyError:
+            text = xmlrpc.client.dumps(xmlrpc.client.Fault(1, "no such method"), methodresponse=True)
+        except (ProtocolError, xmlrpc.client.Fault):
+            self.send_error(400)
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "text/xml")
+        self.send_header("Content-Length", str(len(body := text.encode())))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Nothing: whoever calls may do so as often as he likes."""
 
 
 # What the answers mean
@@ -228,14 +220,10 @@ def system_state(value: Any) -> tuple[NodesByTopic, NodesByTopic]:
 def offers(publishers: NodesByTopic, types: Any) -> tuple[Offer, ...]:
     """What is published now, sorted by topic, with the answer of getTopicTypes. A name that is none is left out."""
     known: dict[str, str] = {}
-    for pair in types if isinstance(types, list) else [None]:
-        match pair:
-            case [str(topic), str(name)]:
-                # "*" for a topic that nobody has typed yet, or a hostile name: unknown either way
-                with contextlib.suppress(DefinitionError):
-                    known[topic] = normalised_type_name(name)
-            case _:
-                raise ProtocolError("the master's topic types are not [topic, type] pairs")
+    for topic, name in _pairs(types):
+        # "*" for a topic that nobody has typed yet, or a hostile name: unknown either way
+        with contextlib.suppress(DefinitionError):
+            known[topic] = normalised_type_name(str(name))
     return tuple(
         Offer(topic, known.get(topic, UNKNOWN_TYPE), () if topic in SHARED else tuple(sorted(set(nodes))))
         for topic, nodes in sorted(publishers.items())
@@ -250,20 +238,25 @@ def strings(value: Any) -> list[str]:
     return list(dict.fromkeys(value))
 
 
-def tcpros_endpoint(value: Any) -> Endpoint:
+def tcpros_address(value: Any) -> Address:
     """Of requestTopic: where the publisher listens. Raises ProtocolError."""
     match value:
         case ["TCPROS", host, port, *_]:
-            return read_endpoint(host, port)
+            return read_address(host, port)
     raise ProtocolError("the publisher does not offer TCPROS")
 
 
 def _nodes_by_topic(value: Any) -> NodesByTopic:
     nodes: NodesByTopic = {}
+    for topic, names in _pairs(value):
+        nodes.setdefault(topic, []).extend(strings(names))
+    return nodes
+
+
+def _pairs(value: Any) -> Iterator[tuple[str, Any]]:
     for pair in value if isinstance(value, list) else [None]:
         match pair:
-            case [str(topic), names]:
-                nodes.setdefault(topic, []).extend(strings(names))
+            case [str(topic), about]:
+                yield topic, about
             case _:
-                raise ProtocolError("the master's state does not have [topic, nodes] pairs")
-    return nodes
+                raise ProtocolError("what the master says of its topics are not pairs of a topic and something")

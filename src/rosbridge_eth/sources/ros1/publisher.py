@@ -13,7 +13,7 @@ from rosbridge_eth.sources.ros1 import api, tcpros
 from rosbridge_eth.sources.ros1.addressing import read_uri
 
 if TYPE_CHECKING:
-    from rosbridge_eth.sources.ros1.node import Node
+    from rosbridge_eth.sources.ros1.source import Ros1Source
 
 FIRST_RETRY: Final = 0.1
 LAST_RETRY: Final = 10.0
@@ -42,7 +42,7 @@ class Publisher(threading.Thread):
     kept: the master does not list it any more; it is over when its connection ends.
     """
 
-    def __init__(self, node: Node, topic: str, uri: str) -> None:
+    def __init__(self, node: Ros1Source, topic: str, uri: str) -> None:
         super().__init__(name=f"ros1 {topic}", daemon=True)
         self.topic, self.uri = topic, uri
         self.publication: tcpros.Publication | None = None
@@ -79,7 +79,7 @@ class Publisher(threading.Thread):
             "requestTopic", node.caller_id, topic, [["TCPROS"]],
         )  # fmt: skip
         with (
-            socket.create_connection(api.tcpros_endpoint(answer), node.timeout) as sock,
+            socket.create_connection(api.tcpros_address(answer), node.timeout) as sock,
             sock.makefile("rb") as stream,
         ):
             _tune(sock)
@@ -93,20 +93,15 @@ class Publisher(threading.Thread):
             self._read(sock, stream, publication)
 
     def _read(self, sock: socket.socket, stream: BinaryIO, publication: tcpros.Publication) -> None:
+        node = self._node
         while True:
             length = tcpros.read_length(stream)  # until then, silence is no fault
-            with self._node.deadlines.within(sock, STALLED + length / SLOWEST):
-                self._take(stream, length, publication)
-
-    def _take(self, stream: BinaryIO, length: int, publication: tcpros.Publication) -> None:
-        if not self._node.make_room(length):
-            self._node.passed_over(self, length)
-            tcpros.pass_over(stream, length)
-            return
-        try:
-            self._node.received(self.topic, publication, tcpros.read_exactly(stream, length))
-        finally:
-            self._node.free_room(length)
+            with node.deadlines.within(sock, STALLED + length / SLOWEST), node.room(length) as fits:
+                if fits:
+                    node.received(self.topic, publication, tcpros.read_exactly(stream, length))
+                else:
+                    node.passed_over(self, length)
+                    tcpros.pass_over(stream, length)
 
 
 def _tune(sock: socket.socket) -> None:

@@ -1,12 +1,28 @@
-"""The parts of rclpy that are used, imported when a source is opened: most robots and all servers do without."""
+"""What is used of rclpy, imported when a source is opened, and what its objects say: names, qualities, definitions.
+
+A definition comes out of the class that rosidl generated. That is what rclpy subscribes with, so its description, not
+some file found beside it, says what the bytes are. It has that description in every ROS 2 distribution: names in
+`get_fields_and_field_types()`, types in `SLOT_TYPES` (rosidl_parser.definition). Written out as MSG with its parts (as
+in an mcap file), it passes the same checks as a definition that came over the network.
+
+Which quality of service a subscription asks for (DDS 1.4, 2.2.3): it gets nothing from a publisher that offers less
+than it asks for (best effort < reliable, volatile < transient local). Asking for less than is offered loses what could
+have been had: retransmission, the last latched message. So it asks for the most that all publishers offer, and if what
+they offer changes, the subscription changes too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Fielddefs
+
+from rosbridge_eth.capture import normalised_type_name
+from rosbridge_eth.capture.definitions import referred, write_text
 from rosbridge_eth.errors import SourceError
 
 GET_RCLPY: Final = (
@@ -15,6 +31,8 @@ GET_RCLPY: Final = (
     "message packages, such as ros-nav-msgs; docs/howto-ros2.md tells more"
 )
 _UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
+_BASES: Final = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
+"""IDL names (OMG IDL 4.2, 7.4.1.4.4.2) that MSG spells otherwise; the sized integers are alike."""
 
 
 def import_rclpy() -> Any:
@@ -63,3 +81,68 @@ def type_hash_of(endpoint: Any) -> str | None:
 def first_line(error: BaseException) -> str:
     """What an error of rclpy says, without the places in its own code."""
     return str(error).strip().partition("\n")[0].partition(", at ")[0] or type(error).__name__
+
+
+class Quality(NamedTuple):
+    """reliable: lost samples are sent again. latched: late subscribers get the last samples (transient local)."""
+
+    reliable: bool
+    latched: bool
+
+    def __str__(self) -> str:
+        return f"{'reliable' if self.reliable else 'best effort'}, {'transient local' if self.latched else 'volatile'}"
+
+
+def quality_of(endpoint: Any) -> Quality:
+    """What an endpoint offers; a policy that is not known counts as the lesser."""
+    profile = endpoint.qos_profile
+    latched = profile.durability.name in ("TRANSIENT_LOCAL", "PERSISTENT")
+    return Quality(profile.reliability.name == "RELIABLE", latched)
+
+
+def most_that_all_offer(offered: Iterable[Quality]) -> Quality:
+    """What a subscription can ask for and be matched by every one of them; of none: the most."""
+    known = list(offered)
+    return Quality(all(quality.reliable for quality in known), all(quality.latched for quality in known))
+
+
+def message_class(type_name: str) -> Any:
+    """The generated class of `pkg/msg/Name`. SourceError where no installed package has it, or it is no type's name."""
+    package, namespace, name = normalised_type_name(type_name).split("/")
+    try:
+        return getattr(import_module(f"{package}.{namespace}"), name)
+    except (ImportError, AttributeError):
+        raise SourceError(
+            f"message type {type_name} is not installed here; install package {package}, "
+            "or source the workspace that has it before starting the robot"
+        ) from None
+
+
+def definition_text(type_name: str, class_of: Callable[[str], Any] = message_class) -> str:
+    """The type and all it refers to, in the MSG format with sections. Raises SourceError."""
+    types: dict[str, Fielddefs] = {}
+    unread = [type_name]
+    while unread:
+        if (name := unread.pop(0)) not in types:
+            generated = class_of(name)
+            kinds = zip(generated.get_fields_and_field_types(), generated.SLOT_TYPES, strict=True)
+            types[name] = [(field, _type(kind)) for field, kind in kinds]
+            unread += [part for _, description in types[name] if (part := referred(description)) is not None]
+    return write_text(type_name, types)
+
+
+def _type(kind: Any) -> Any:
+    """A type in rosbags' tree form. Classes are told by name: rosidl is not imported."""
+    match type(kind).__name__:
+        case "BasicType":
+            return (Nodetype.BASE, (_BASES.get(kind.typename, kind.typename), 0))
+        case "UnboundedString" | "BoundedString" | "UnboundedWString" | "BoundedWString" as name:
+            return (Nodetype.BASE, ("wstring" if "W" in name else "string", getattr(kind, "maximum_size", 0)))
+        case "NamespacedType":
+            return (Nodetype.NAME, "/".join(kind.namespaced_name()))
+        case "Array":
+            return (Nodetype.ARRAY, (_type(kind.value_type), kind.size))
+        case "UnboundedSequence" | "BoundedSequence":
+            return (Nodetype.SEQUENCE, (_type(kind.value_type), getattr(kind, "maximum_size", 0)))
+        case other:
+            raise SourceError(f"a field of kind {other} is not known here")

@@ -1,34 +1,26 @@
 """A live ROS 2 graph, through the robot's own rclpy: any DDS or Zenoh middleware that it is set up with.
 
-Messages are subscribed to as bytes and decoded by rosbags, as those of every
-other source: equal messages give equal records. One thread waits in rclpy and
-puts what arrives into a Backlog; the thread that runs the source empties it.
+Messages are subscribed to as bytes and decoded by rosbags, as those of every other source: equal messages give equal
+records. Every LOOK_EVERY the graph is read (from rclpy's own memory, microseconds): topics appear, publishers change
+what they offer. A subscription stays for KEEP after the last publisher has gone, so that one that is restarted misses
+nothing.
 
-Every LOOK_EVERY the graph is read (from rclpy's own memory, microseconds): topics
-appear, publishers change what they offer. A subscription stays for KEEP after
-the last publisher has gone, so that one that is restarted misses nothing.
-
-Where the middleware numbers messages and says who published them (Fast DDS on
-Kilted), losses are counted and a change of subscription loses and repeats nothing.
+Where the middleware numbers messages and says who published them (Fast DDS on Kilted), losses are counted and a change
+of subscription loses and repeats nothing.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
-from rosbridge_eth.capture import Decoder, RawMessage
+from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.backlog import Backlog
-from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Source, SystemClock
-from rosbridge_eth.sources.ros2.definitions import decoder_of, message_class
-from rosbridge_eth.sources.ros2.quality import Quality, most_that_all_offer, quality_of
-from rosbridge_eth.sources.ros2.rclpy_parts import first_line, import_rclpy, name_of, take, type_hash_of
-from rosbridge_eth.sources.selection import Selection
+from rosbridge_eth.sources import live
+from rosbridge_eth.sources.protocol import Clock, Offer, Selection
+from rosbridge_eth.sources.ros2 import rclpy_parts as parts
 
 log = logging.getLogger(__name__)
 
@@ -47,21 +39,6 @@ _SHARED: Final = frozenset({"/rosout", "/parameter_events"})
 """Topics that every node publishes; naming a node does not mean them."""
 
 
-@dataclass(frozen=True)
-class Ros2Settings:
-    """How the graph is joined.
-
-    domain: ROS domain; None follows ROS_DOMAIN_ID.
-    node: name of the node that the robot becomes, without namespace.
-    depth: messages that the middleware keeps of each topic for us.
-    """
-
-    kind: ClassVar[str] = "ros2"
-    domain: int | None = None
-    node: str = "rosbridge_eth"
-    depth: int = 256
-
-
 @dataclass
 class _Topic:
     """A watched topic: its subscription and what is known of its publishers."""
@@ -69,7 +46,7 @@ class _Topic:
     offer: Offer
     generated: Any
     decoder: Decoder
-    quality: Quality
+    quality: parts.Quality
     subscriptions: int = 0  # so far
     subscription: Any = None
     leaving: Any = None  # the subscription that `subscription` takes the place of
@@ -82,94 +59,62 @@ class _Topic:
     numbered: bool = False  # whether the middleware says publisher and number of a message
 
 
-class Ros2Source(Source):
-    """The watched topics of one ROS 2 graph. Its own rclpy context: no signal handler is set, no argument read."""
+class Ros2Source(live.LiveSource):
+    """The watched topics of one ROS 2 graph. Its own rclpy context: no signal handler is set, no argument read.
+
+    domain: ROS domain; None follows ROS_DOMAIN_ID. node: name of the node that the robot becomes, without namespace.
+    depth: messages that the middleware keeps of each topic for us.
+    counts: messages received; lost, which did not reach this process (best effort, or faster than the queue of `depth`
+    was emptied); foreign, of a publisher with another definition of the type.
+    """
 
     kind = "ros2"
-    live = True
 
-    def __init__(self, settings: Ros2Settings, selection: Selection, clock: Clock | None = None) -> None:
+    def __init__(
+        self, selection: Selection, clock: Clock | None = None, *,
+        domain: int | None = None, node: str = "rosbridge_eth", depth: int = 256,
+    ) -> None:  # fmt: skip
         """Joins the graph. Raises SourceError if rclpy is not there or cannot."""
-        self._settings, self._selection, self._clock = settings, selection, clock or SystemClock()
-        self._backlog = Backlog()
-        self.counts: Counter[tuple[str, str]] = Counter()
-        """By topic, messages received; lost, which did not reach this process (best effort, or faster than the queue of
-        `depth` was emptied); foreign, of a publisher with another definition of the type."""
+        super().__init__(selection, clock, live.MESSAGES, live.SIZE)
+        self._depth = depth
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._unusable: set[tuple[str, str]] = set()
-        self._said: set[tuple[str, str]] = set()
         self._look_now = False
-        self._ending = threading.Event()
-        self._receiving: threading.Thread | None = None
-        self._failure: BaseException | None = None
-        self._closing = threading.Lock()
-        self._open = False
-        self._rclpy = import_rclpy()
+        self._rclpy = parts.import_rclpy()
         self._context = self._rclpy.Context()
         try:
             # No logging: rclpy would open files in the home of whoever runs the robot.
-            self._context.init(args=[], initialize_logging=False, domain_id=settings.domain)
+            self._context.init(args=[], initialize_logging=False, domain_id=domain)
             self._node = self._rclpy.Node(
-                settings.node,
-                context=self._context,
-                use_global_arguments=False,
-                enable_rosout=False,
+                node, context=self._context, use_global_arguments=False, enable_rosout=False,
                 start_parameter_services=False,
-            )
+            )  # fmt: skip
             self._executor = self._rclpy.SingleThreadedExecutor(context=self._context)
             self._executor.add_node(self._node)
         except Exception as error:
             # rclpy has classes for bad names and domains and passes on what the middleware raises: an open set.
             self._context.try_shutdown()
-            raise SourceError(f"the ROS 2 graph cannot be joined: {first_line(error)}") from error
+            raise SourceError(f"the ROS 2 graph cannot be joined: {parts.first_line(error)}") from error
         self._open = True
         self._full_name = self._node.get_fully_qualified_name()
-
-    # What Source asks for
 
     def offers(self) -> Sequence[Offer]:
         """The topics that somebody publishes now, without hidden ones. Discovery takes a second or two."""
         return self._read_graph()[0]
 
-    def run(self, emit: Emit, stop: threading.Event) -> None:
-        """Emit what arrives until `stop` is set or the source is closed. Raises SourceError."""
-        if not self._open or self._receiving is not None:
-            raise SourceError("a ROS 2 source runs once")
-        self._receiving = threading.Thread(target=self._receive, name="rclpy", daemon=True)
-        self._receiving.start()
-        try:
-            while not stop.is_set():
-                message = self._backlog.take(0.1)
-                if message is not None:
-                    emit(message)
-                elif not self._receiving.is_alive():
-                    break
-        finally:
-            self.close()
-        if isinstance(self._failure, RuntimeError):
-            raise SourceError(f"the ROS 2 graph was lost: {first_line(self._failure)}") from self._failure
-        if self._failure is not None:
-            raise self._failure
-
     def close(self) -> None:
         """Leave the graph."""
         self._ending.set()
         self._backlog.close()
-        with self._closing:
-            if not self._open:
-                return
-            self._open = False
+        with self._lock:
+            was_open, self._open = self._open, False
+        if was_open:
             self._executor.wake()
-            if self._receiving is not None:
+            if self._receiving.is_alive():
                 self._receiving.join(STOP_TIME)
             self._executor.shutdown(timeout_sec=STOP_TIME)
             self._node.destroy_node()
             self._context.try_shutdown()
-
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """Messages received and lost here for want of time, by topic."""
-        return self._backlog.dropped
 
     # The receiving thread
 
@@ -186,11 +131,8 @@ class Ros2Source(Source):
                     self._tell_unmatched()
                     complain_at = float("inf")
                 self._executor.spin_once(timeout_sec=max(due - now, 0.0))
-        except BaseException as error:  # handed to the thread that runs the source, which raises it
-            if not self._ending.is_set():
-                self._failure = error
-        finally:
-            self._backlog.close()
+        except RuntimeError as error:
+            raise SourceError(f"the ROS 2 graph was lost: {parts.first_line(error)}") from error
 
     def _now(self) -> float:
         return self._clock.monotonic_ns() / 1e9
@@ -203,11 +145,8 @@ class Ros2Source(Source):
         for key in published:
             if topic := self._topics.get(key):
                 topic.last_seen = now
-        waiting = [
-            topic.offer
-            for key, topic in self._topics.items()
-            if key not in published and now - topic.last_seen < KEEP
-        ]
+        known = self._topics.items()
+        waiting = [topic.offer for key, topic in known if key not in published and now - topic.last_seen < KEEP]
         wanted = {(offer.topic, offer.type_name): offer for offer in self._selection.resolve([*offers, *waiting])}
         for key in self._topics.keys() - wanted.keys():
             self._leave(self._topics.pop(key))
@@ -225,13 +164,13 @@ class Ros2Source(Source):
         offers: list[Offer] = []
         publishers: dict[tuple[str, str], list[Any]] = {}
         for name, _ in sorted(self._node.get_topic_names_and_types()):
-            if any(part.startswith("_") for part in name.split("/")) and not self._selection.names(name):
+            if any(part.startswith("_") for part in name.split("/")) and name not in self._selection.named_topics:
                 continue
             if not (any_topic or self._selection.wants(Offer(name, ""))):
                 continue
             nodes: dict[str, set[str]] = {}
             for endpoint in self._node.get_publishers_info_by_topic(name):
-                node = name_of(endpoint)
+                node = parts.name_of(endpoint)
                 if node == self._full_name:
                     continue
                 found = nodes.setdefault(endpoint.topic_type, set())
@@ -244,10 +183,10 @@ class Ros2Source(Source):
     def _join(self, offer: Offer, publishers: Sequence[Any], now: float) -> None:
         key = (offer.topic, offer.type_name)
         try:
-            quality = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
-            generated, decoder = message_class(offer.type_name), decoder_of(offer.type_name)
-            topic = _Topic(offer, generated, decoder, quality, last_seen=now)
-            topic.subscription = self._subscribe(topic, topic.quality)
+            quality = parts.most_that_all_offer(map(parts.quality_of, publishers))
+            decoder = decoder_for(Wire.CDR, offer.type_name, parts.definition_text(offer.type_name))
+            topic = _Topic(offer, parts.message_class(offer.type_name), decoder, quality, last_seen=now)
+            topic.subscription = self._subscribe(topic, quality)
         except SourceError as error:
             self._unusable.add(key)
             log.warning("%s is left out: %s", offer, error)
@@ -255,27 +194,22 @@ class Ros2Source(Source):
         self._topics[key] = topic
         log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)
 
-    def _subscribe(self, topic: _Topic, quality: Quality) -> Any:
+    def _subscribe(self, topic: _Topic, quality: parts.Quality) -> Any:
         qos = self._rclpy.qos
         profile = qos.QoSProfile(
-            depth=self._settings.depth,
-            history=qos.HistoryPolicy.KEEP_LAST,
+            depth=self._depth, history=qos.HistoryPolicy.KEEP_LAST,
             reliability=getattr(qos.ReliabilityPolicy, "RELIABLE" if quality.reliable else "BEST_EFFORT"),
             durability=getattr(qos.DurabilityPolicy, "TRANSIENT_LOCAL" if quality.latched else "VOLATILE"),
-        )
+        )  # fmt: skip
         try:
+            events = self._rclpy.SubscriptionEventCallbacks(
+                incompatible_qos=self._incompatible, use_default_callbacks=False
+            )
             return self._node.create_subscription(
-                topic.generated,
-                topic.offer.topic,
-                self._callback(topic),
-                profile,
-                event_callbacks=self._rclpy.SubscriptionEventCallbacks(
-                    incompatible_qos=self._incompatible, use_default_callbacks=False
-                ),
-                raw=True,
+                topic.generated, topic.offer.topic, self._callback(topic), profile, event_callbacks=events, raw=True
             )
         except (RuntimeError, ValueError, TypeError) as error:
-            raise SourceError(f"it cannot be subscribed to: {first_line(error)}") from error
+            raise SourceError(f"it cannot be subscribed to: {parts.first_line(error)}") from error
 
     def _incompatible(self, event: Any) -> None:
         """A publisher has come that offers less than we ask for: look at once, not at the next turn."""
@@ -284,8 +218,8 @@ class Ros2Source(Source):
     def _own_type_hash(self, offer: Offer) -> str | None:
         """The hash of the type as it is installed here, which our own subscription advertises."""
         for endpoint in self._node.get_subscriptions_info_by_topic(offer.topic):
-            if name_of(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
-                return type_hash_of(endpoint)
+            if parts.name_of(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
+                return parts.type_hash_of(endpoint)
         return None
 
     def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
@@ -294,13 +228,12 @@ class Ros2Source(Source):
             topic.type_hash = self._own_type_hash(topic.offer)
         present = {bytes(endpoint.endpoint_gid): endpoint for endpoint in publishers}
         topic.publishers = frozenset(present)
-        foreign = {
-            gid: endpoint
-            for gid, endpoint in present.items()
-            if topic.type_hash is not None and type_hash_of(endpoint) not in (None, topic.type_hash)
-        }
-        for endpoint in foreign.values():
-            self._tell_foreign(topic, endpoint)
+        known = (None, topic.type_hash)
+        foreign = [] if topic.type_hash is None else [
+            gid for gid, endpoint in present.items() if parts.type_hash_of(endpoint) not in known
+        ]
+        for gid in foreign:
+            self._tell_foreign(topic.offer, present[gid])
         topic.foreign = frozenset(foreign)
         for gone in topic.sequence.keys() - present.keys():
             del topic.sequence[gone]
@@ -317,7 +250,7 @@ class Ros2Source(Source):
                 self._node.destroy_subscription(topic.leaving)
                 topic.leaving = None
             return
-        wanted = most_that_all_offer(quality_of(endpoint.qos_profile) for endpoint in publishers)
+        wanted = parts.most_that_all_offer(map(parts.quality_of, publishers))
         if not publishers or wanted == topic.quality:
             return
         if topic.numbered:
@@ -331,7 +264,7 @@ class Ros2Source(Source):
 
     def _drain(self, topic: _Topic) -> None:
         """Take what the leaving subscription holds, which is older than what the new one brings."""
-        while (waiting := take(topic.leaving, topic.generated)) is not None:
+        while (waiting := parts.take(topic.leaving, topic.generated)) is not None:
             self._arrived(topic, *waiting)
 
     def _leave(self, topic: _Topic) -> None:
@@ -351,7 +284,7 @@ class Ros2Source(Source):
             self._arrived(topic, raw, info)
             # What else waits is taken at once: a turn of the executor costs several times as much as a message.
             for _ in range(AT_ONCE if current else 0):
-                if (waiting := take(topic.subscription, topic.generated)) is None:
+                if (waiting := parts.take(topic.subscription, topic.generated)) is None:
                     break
                 self._arrived(topic, *waiting)
 
@@ -376,45 +309,33 @@ class Ros2Source(Source):
                 return  # received before the subscription was changed
             topic.sequence[publisher] = number
             if last is not None and number > last + 1:
-                self._lost(topic, number - last - 1)
+                self._tell_lost(topic, number - last - 1)
         self.counts[topic.offer.topic, "received"] += 1
         received_ns = info.get("received_timestamp") or self._clock.wall_ns()
         self._backlog.put(RawMessage(topic.offer.topic, topic.offer.type_name, received_ns, raw, topic.decoder))
 
     # What a person is told, once
 
-    def _lost(self, topic: _Topic, count: int) -> None:
-        self.counts[topic.offer.topic, "lost"] += count
-        if self._first(topic.offer.topic, "lost"):
-            why = "a larger depth in [source] may help" if topic.quality.reliable else "its publisher is best effort"
-            name = topic.offer.topic
-            log.warning("%s: messages were lost on their way here (%d now, then counted); %s", name, count, why)
+    def _tell_lost(self, topic: _Topic, count: int) -> None:
+        name = topic.offer.topic
+        self.counts[name, "lost"] += count
+        why = "a larger depth in [source] may help" if topic.quality.reliable else "its publisher is best effort"
+        text = f"{name}: messages were lost on their way here ({count} now, then counted); {why}"
+        self._say(f"lost {name}", text)
 
-    def _tell_foreign(self, topic: _Topic, endpoint: Any) -> None:
-        if self._first(topic.offer.topic, type_hash_of(endpoint) or ""):
-            kind = topic.offer.type_name
-            log.warning(
-                "%s: %s publishes with another definition of %s than is installed here; its messages are left out and "
-                "counted. Build both from the same version of package %s",
-                topic.offer.topic,
-                name_of(endpoint) or "somebody",
-                kind,
-                kind.partition("/")[0],
-            )
+    def _tell_foreign(self, offer: Offer, endpoint: Any) -> None:
+        self._say(
+            f"foreign {offer.topic} {parts.type_hash_of(endpoint)}",
+            f"{offer.topic}: {parts.name_of(endpoint) or 'somebody'} publishes with another definition of "
+            f"{offer.type_name} than is installed here; its messages are left out and counted. Build both from the "
+            f"same version of package {offer.type_name.partition('/')[0]}",
+        )
 
     def _tell_unmatched(self) -> None:
         offers = self._read_graph()[0]
         missing = self._selection.unmatched([*offers, *(topic.offer for topic in self._topics.values())])
         if missing:
-            there = ", ".join(map(str, offers[:20])) or "no topics"
             log.warning(
                 "nothing publishes %s yet; domain %d has %s. Check ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE",
-                ", ".join(missing),
-                self._context.get_domain_id(),
-                there,
+                ", ".join(missing), self._context.get_domain_id(), ", ".join(map(str, offers[:20])) or "no topics",
             )
-
-    def _first(self, topic: str, what: str) -> bool:
-        first = (topic, what) not in self._said
-        self._said.add((topic, what))
-        return first

@@ -11,12 +11,12 @@ import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule
 from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros1 import Cause, Ros1Settings, Ros1Source
+from rosbridge_eth.sources.ros1 import Ros1Source
+from rosbridge_eth.sources.ros1.publisher import Cause
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
 PUBLISHERS = Path(__file__).with_name("publishers.py")
@@ -111,8 +111,8 @@ class Listening:
 
     def __init__(self, uri: str, topics: Sequence[str] = (), nodes: Sequence[str] = (), *,
                  tolerant: bool = False, **settings: object) -> None:
-        chosen = replace(Ros1Settings(master=uri, hostname="127.0.0.1"), **settings)  # type: ignore[arg-type]
-        self.source = Ros1Source(chosen, Selection(topics, nodes))
+        chosen = {"master": uri, "hostname": "127.0.0.1", **settings}
+        self.source = Ros1Source(Selection(topics, nodes), **chosen)  # type: ignore[arg-type]
         self.capture = Capture([TopicRule("**", limit=4096)], source_kind="ros1")
         self.raw: list[RawMessage] = []
         self.data: dict[str, list] = {}

@@ -8,21 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.ros1.addressing import (
-    Endpoint,
     ProtocolError,
     bind_host,
     is_graph_name,
-    master_endpoint,
+    master_address,
     node_name,
     own_host,
-    read_endpoint,
+    read_address,
     read_uri,
-    uri_of,
 )
 
-MASTER = Endpoint("127.0.0.1", 11311)
+MASTER = Address("127.0.0.1", 11311)
 
 
 @pytest.mark.parametrize(
@@ -37,14 +36,14 @@ MASTER = Endpoint("127.0.0.1", 11311)
     ],
 )
 def test_the_master_is_where_the_configuration_or_the_environment_says(configured, environment, expected):
-    assert master_endpoint(configured, environment) == expected
+    assert master_address(configured, environment) == expected
 
 
 def test_a_wrong_master_is_told_with_the_place_where_it_is_written():
     with pytest.raises(SourceError, match="the environment variable ROS_MASTER_URI is wrong"):
-        master_endpoint(None, {"ROS_MASTER_URI": "robot:11311"})
+        master_address(None, {"ROS_MASTER_URI": "robot:11311"})
     with pytest.raises(SourceError, match=r"`master` of \[source\] is wrong"):
-        master_endpoint("http://robot:99999", {})
+        master_address("http://robot:99999", {})
 
 
 @pytest.mark.parametrize(
@@ -61,14 +60,14 @@ def test_ros_hostname_precedes_ros_ip(configured, environment, expected):
 
 
 def test_a_master_that_cannot_be_found_leaves_our_own_address_open():
-    assert own_host(None, Endpoint("no-such-host.invalid", 11311), {}) is None
+    assert own_host(None, Address("no-such-host.invalid", 11311), {}) is None
 
 
 def test_we_listen_where_we_say():
     assert bind_host("localhost") == bind_host("127.0.0.1") == "127.0.0.1"
     assert bind_host("robot") == bind_host("192.0.2.1") == "0.0.0.0"
     assert bind_host("2001:db8::1") == "::"
-    assert read_uri(uri_of("2001:db8::1", 5)) == ("2001:db8::1", 5)
+    assert read_uri(f"http://{Address('2001:db8::1', 5)}/") == ("2001:db8::1", 5)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +92,7 @@ def test_any_text_is_an_endpoint_or_refused(text):
 @given(st.one_of(st.none(), st.integers(), st.text(), st.booleans()), st.one_of(st.none(), st.integers(), st.text()))
 def test_any_values_are_an_endpoint_or_refused(host, port):
     with contextlib.suppress(ProtocolError):
-        assert read_endpoint(host, port) == (host, port)
+        assert read_address(host, port) == (host, port)
 
 
 def test_names():

@@ -25,9 +25,10 @@ from bridge.sources.ros1.impostors import (
     flooding,
     saying,
 )
+from rosbridge_eth.config import Address
 from rosbridge_eth.sources import Offer
 from rosbridge_eth.sources.ros1 import api
-from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError
+from rosbridge_eth.sources.ros1.addressing import ProtocolError
 
 LIMIT = 10_000
 
@@ -43,7 +44,7 @@ def asked(conversation, deadlines, timeout: float = 5.0):
     """What a call says that is answered so."""
     peer = Peer(conversation)
     with closing_all(peer):
-        return api.call(Endpoint("127.0.0.1", peer.port), deadlines, timeout, LIMIT, "getPid", "/me")
+        return api.call(Address("127.0.0.1", peer.port), deadlines, timeout, LIMIT, "getPid", "/me")
 
 
 def answered(value: object) -> bytes:
@@ -179,7 +180,7 @@ ANY = st.recursive(
 @example([[["/a", ["/n"]]], [], []])
 @example([[["/a", ["/n"], 1]], [], []])
 def test_any_value_is_what_was_asked_for_or_an_error(value):
-    for read in (api.system_state, api.strings, api.tcpros_endpoint, lambda types: api.offers({"/a": ["/n"]}, types)):
+    for read in (api.system_state, api.strings, api.tcpros_address, lambda types: api.offers({"/a": ["/n"]}, types)):
         with contextlib.suppress(ProtocolError):
             read(value)
 

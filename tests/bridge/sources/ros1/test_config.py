@@ -7,18 +7,18 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.config import RobotConfig, parse_config
+from rosbridge_eth.config.models import Ros1Config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.sources import open_source
-from rosbridge_eth.sources.ros1 import Ros1Settings, Ros1Source
+from rosbridge_eth.sources.ros1 import Ros1Source
 
 
-def source(text: str) -> Ros1Settings:
+def source(text: str) -> Ros1Config:
     config = parse_config(RobotConfig, f'topics = ["/a"]\n[source]\nkind = "ros1"\n{text}', Path("robot.toml"))
-    return config.source.settings()
+    return config.source
 
 
 def test_nothing_more_need_be_said():
-    assert source("") == Ros1Settings()
     opened = open_source(source(""), parse_config(RobotConfig, 'topics = ["/a"]', Path("robot.toml")).selection())
     assert isinstance(opened, Ros1Source)
 
@@ -30,7 +30,10 @@ def test_every_key_arrives():
         node = "fleet/recorder"
         max_message = "1 MiB"
     """
-    assert source(text) == Ros1Settings("http://192.0.2.7:11311", "192.0.2.8", "fleet/recorder", 2**20)
+    assert source(text).model_dump() == {
+        "kind": "ros1", "master": "http://192.0.2.7:11311", "hostname": "192.0.2.8", "node": "fleet/recorder",
+        "max_message": 2**20,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

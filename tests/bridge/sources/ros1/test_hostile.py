@@ -29,7 +29,8 @@ from bridge.sources.ros1.impostors import (
     numbered,
     saying,
 )
-from rosbridge_eth.sources.ros1 import Cause, publisher
+from rosbridge_eth.sources.ros1 import publisher
+from rosbridge_eth.sources.ros1.publisher import Cause
 from rosbridge_eth.sources.ros1.tcpros import encode_header
 
 MIB = 2**20

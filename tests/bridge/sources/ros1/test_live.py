@@ -11,8 +11,9 @@ import pytest
 from bridge.sources.ros1.graph import Graph, Listening, eventually
 from rosbridge_eth.capture import Capture, RawMessage, Restoration, TopicRule, definition_line, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import BagSettings, BagSource, Offer, Selection, sample_bag
-from rosbridge_eth.sources.ros1 import Cause, Ros1Settings, Ros1Source
+from rosbridge_eth.sources import BagSource, Offer, Selection, sample_bag
+from rosbridge_eth.sources.ros1 import Ros1Source
+from rosbridge_eth.sources.ros1.publisher import Cause
 
 pytestmark = pytest.mark.service
 
@@ -181,7 +182,7 @@ def unregister_everyone(graph: Graph, topic: str) -> None:
 def test_rosbag_play_brings_the_bag_byte_for_byte(graph, require):
     """rosbag play is roscpp: the other client library."""
     require("rosbag")
-    bag = BagSource(BagSettings(sample_bag(), None), Selection(["/robot_1/*"]))
+    bag = BagSource(sample_bag(), Selection(["/robot_1/*"]), speed=None)
     expected = [(message.topic, message.raw) for message in bag.messages()]
     with Listening(graph.uri, ["/robot_1/*"]) as listening:
         play = graph.start("/usr/lib/rosbag/play", "--wait-for-subscribers", "-r", "10", "-q", str(sample_bag()))
@@ -203,12 +204,12 @@ def test_a_hundred_hertz_on_ten_topics_without_a_loss(graph):
             listening.wait_for(topic, 1000, 60)
     for topic in topics:
         assert listening.numbers(topic) == list(range(1000))
-        assert topic not in listening.source.dropped
+        assert (topic, "dropped") not in listening.source.lost
 
 
 def test_what_is_published_now_is_offered_with_types_and_nodes(graph):
     graph.publish("offering", {"topic": "/offered", "kind": "odometry", "count": 1, "latch": True}, wait=False)
-    source = Ros1Source(Ros1Settings(graph.uri), Selection(["/offered"]))
+    source = Ros1Source(Selection(["/offered"]), master=graph.uri)
     assert source.live
     assert source.decoders() == {}
     assert Offer("/offered", "nav_msgs/msg/Odometry", ("/offering",)) in source.offers()
@@ -260,13 +261,13 @@ def test_messages_are_dropped_and_counted_while_nobody_takes_them(graph):
     with listening:
         graph.publish("flood", {"topic": "/flood", "kind": "number", "count": 200})
         eventually(lambda: listening.source.counts["/flood", "received"] == 200, "everything is received")
-        dropped = listening.source.dropped["/flood"]
+        dropped = listening.source.lost["/flood", "dropped"]
         take.set()
         listening.wait_for("/flood", 200 - dropped)
     numbers = listening.numbers("/flood")
     assert numbers[-15:] == list(range(185, 200))  # the newest are kept
     assert len(numbers) in (16, 17)  # as many as may wait, and the one that was being emitted
-    assert listening.source.dropped["/flood"] == dropped == 200 - len(numbers)
+    assert listening.source.lost["/flood", "dropped"] == dropped == 200 - len(numbers)
 
 
 def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
@@ -295,4 +296,4 @@ def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
         assert (record.source, record.clock) == ("ros1", True)
         assert 0 < record.captured_ns - record.received_ns < 10**10
         assert restoration.decoder.encode(restoration.restore(record.data).message) == raw.raw
-    assert capture.lost(listening.source.dropped) == []
+    assert capture.lost(listening.source.lost) == []

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosbridge_eth.sources import Selection, SystemClock
-from rosbridge_eth.sources.backlog import Backlog
-from rosbridge_eth.sources.ros1 import api, node
-from rosbridge_eth.sources.ros1.addressing import Endpoint, ProtocolError
-from rosbridge_eth.sources.ros1.node import Node
+from rosbridge_eth.sources import Selection
+from rosbridge_eth.sources.ros1 import Ros1Source, api, source
+from rosbridge_eth.sources.ros1.addressing import ProtocolError
 from rosbridge_eth.sources.ros1.publisher import FIRST_RETRY, LAST_RETRY, STEADY, Publisher
 from rosbridge_eth.sources.ros1.tcpros import Publication
 
@@ -23,7 +20,7 @@ API = "http://me:1/"
 class Script:
     """A master: `state` is what it says, and `calls` what it was asked since it was last looked at."""
 
-    def __init__(self, subject: Node) -> None:
+    def __init__(self, subject: Ros1Source) -> None:
         self.subject = subject
         self.publishers: dict[str, list[str]] = {}  # APIs by topic
         self.subscribers: dict[str, set[str]] = {}
@@ -71,10 +68,7 @@ def begun(monkeypatch):
 
 
 def scripted(patch: pytest.MonkeyPatch, *topics: str, nodes: tuple[str, ...] = ()) -> Script:
-    subject = Node(
-        Endpoint("m", 1), None, "/me", Selection(topics, nodes), Backlog(), Counter(), SystemClock(),
-        max_message=1 << 20, timeout=1.0,
-    )  # fmt: skip
+    subject = Ros1Source(Selection(topics, nodes), master="http://m:1", node="me", max_message=1 << 20, timeout=1.0)
     subject._uri = API
     subject.deadlines.close()
     script = Script(subject)
@@ -225,8 +219,8 @@ def test_a_refused_topic_does_not_keep_the_others_waiting(make, caplog):
 
 
 def test_connections_and_topics_are_limited(make, begun, monkeypatch, caplog):
-    monkeypatch.setattr(node, "MAX_CONNECTIONS", 50)
-    monkeypatch.setattr(node, "MAX_TOPICS", 20)
+    monkeypatch.setattr(source, "MAX_CONNECTIONS", 50)
+    monkeypatch.setattr(source, "MAX_TOPICS", 20)
     script = make("/*")
     script.publishers = {f"/t{n:04}": [f"http://x{n}:{m}/" for m in range(1, 6)] for n in range(1000)}
     script.turn()

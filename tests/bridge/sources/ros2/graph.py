@@ -142,6 +142,10 @@ class Watcher(Program):
         return self._of("record")
 
     @property
+    def declared(self) -> list[dict[str, Any]]:
+        return self._of("declared")
+
+    @property
     def rebuilt(self) -> list[bool]:
         return self._of("rebuilt")
 

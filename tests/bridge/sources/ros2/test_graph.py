@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.sources.ros2.graph import Graph
 from rosbridge_eth.capture import Capture, TopicRule
-from rosbridge_eth.sources import BagSettings, BagSource, Selection, sample_bag
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
 pytestmark = pytest.mark.service
@@ -107,7 +107,7 @@ def test_messages_of_any_type_become_records(ros: Graph):
 
 def test_the_same_odometry_gives_the_same_record_from_ros_1_and_ros_2(ros: Graph):
     """The sample bag was recorded by ROS 1; its Odometry is published again by ROS 2."""
-    source = BagSource(BagSettings(sample_bag(), None), Selection(["/robot_1/odom"]))
+    source = BagSource(sample_bag(), Selection(["/robot_1/odom"]), speed=None)
     capture = Capture([TopicRule("/robot_1/odom")], source_kind=source.kind)
     from_ros1 = [capture.process(raw, 0).data for raw in itertools.islice(source.messages(), 20)]
     for data in from_ros1:
@@ -298,6 +298,7 @@ def test_what_the_middleware_loses_is_counted(ros: Graph):
     assert counts["lost"] > 0
     assert counts["received"] + counts["lost"] == 2001
     assert counts["received"] == len(watcher.records)
+    assert watcher.declared == [{"lost": counts["lost"], "topic": "/t", "why": "lost"}]
 
 
 def test_what_cannot_be_decoded_is_told_and_does_no_harm(ros: Graph, tmp_path):

@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from rosbridge_eth.errors import ExitCode, SourceError
-from rosbridge_eth.sources import Selection, open_source
-from rosbridge_eth.sources.ros2 import Ros2Settings
-from rosbridge_eth.sources.ros2.quality import Quality, most_that_all_offer
+from rosbridge_eth.sources import Selection
+from rosbridge_eth.sources.ros2 import Ros2Source
+from rosbridge_eth.sources.ros2.rclpy_parts import Quality, most_that_all_offer
 
 ALL = [Quality(reliable, latched) for reliable in (True, False) for latched in (True, False)]
 
@@ -18,7 +18,7 @@ ALL = [Quality(reliable, latched) for reliable in (True, False) for latched in (
 def test_without_rclpy_the_error_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)  # as if it were not installed
     with pytest.raises(SourceError) as failure:
-        open_source(Ros2Settings(), Selection(["/odom"]))
+        Ros2Source(Selection(["/odom"]))
     assert failure.value.exit_code == ExitCode.SOURCE
     for hint in ("rclpy", "setup.bash", "pip install 'ros-rclpy[fastrtps]'", "docs/howto-ros2.md"):
         assert hint in str(failure.value)

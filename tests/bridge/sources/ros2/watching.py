@@ -57,7 +57,7 @@ def emit(raw: RawMessage) -> None:
 
 
 try:
-    source = open_source(config.source_and_why({})[0].settings(), config.selection())
+    source = open_source(config.source_and_why({})[0], config.selection())
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
     say(
         {
@@ -69,9 +69,11 @@ try:
 except SourceError as error:
     say({"error": str(error)})
     sys.exit(error.exit_code)
+for line in capture.lost(source.lost):
+    say({"declared": json.loads(line)})
 statistics: dict[str, dict[str, int]] = {}
 for topic in dict.fromkeys(topic for topic, _ in source.counts):
     counts = {what: source.counts[topic, what] for what in ("received", "lost", "foreign")}
-    statistics[topic] = counts | {"dropped": source.dropped.get(topic, 0)}
+    statistics[topic] = counts | {"dropped": source.lost.get((topic, "dropped"), 0)}
 say({"statistics": statistics})
 say({"threads": [thread.name for thread in threading.enumerate()]})
