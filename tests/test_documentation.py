@@ -18,6 +18,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -30,10 +31,10 @@ from conftest import unavailable
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-EXAMPLES = [ROOT / "README.md", DOCS / "smcrypto.md", DOCS / "migration.md", DOCS / "security.md",
+EXAMPLES = [ROOT / "README.md", ROOT / "PACKAGE.md", DOCS / "smcrypto.md", DOCS / "migration.md", DOCS / "security.md",
             ROOT / "README.zh.md", DOCS / "zh" / "quickstart.md"]  # fmt: skip
-PAGES = sorted([ROOT / "README.md", ROOT / "README.zh.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md",
-                ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
+PAGES = sorted([ROOT / "README.md", ROOT / "README.zh.md", ROOT / "PACKAGE.md", ROOT / "CHANGELOG.md",
+                ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
 MODULES = [
     importlib.import_module(module.name)
     for module in pkgutil.walk_packages(smcrypto.__path__, "smcrypto.")
@@ -189,6 +190,12 @@ def test_links_lead_somewhere(page: Path) -> None:
         path = (page.parent / name).resolve() if name else page
         assert path.exists(), target
         assert not fragment or fragment in anchors(path), target
+
+
+def test_the_text_for_a_package_index_has_no_link_into_the_repository() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    text = (ROOT / project["readme"]).read_text("utf-8")
+    assert all(re.match("https:", target) for target in re.findall(r"\]\(([^)\s]+)\)", text))
 
 
 def test_the_index_names_every_page() -> None:

@@ -202,7 +202,7 @@ def _private_key(data: bytes, password: bytes | None, remarks: list[str]) -> tup
         except InvalidKey as error:
             if "password" in str(error) or "curve" in str(error) or "algorithm" in str(error):
                 remarks.append(str(error))
-    elif len(data) in forms and (len(data) == 32 or data[0] == 0):
+    if len(data) in forms and (len(data) == 32 or data[0] == 0):
         form, d = forms[len(data)]
         try:
             return sm2.PrivateKey.from_bytes(d), form
@@ -214,16 +214,14 @@ def _private_key(data: bytes, password: bytes | None, remarks: list[str]) -> tup
 def _public_key(data: bytes) -> tuple[sm2.PublicKey, str] | None:
     """A point of the curve: by chance 64 bytes are one in 2^256 cases, 32 after 02 or 03 in every second."""
     try:
-        if data[:1] == b"\x30":
-            return sm2.PublicKey.from_der(data), "DER, SubjectPublicKeyInfo"
         if len(data) == 64:
             return sm2.PublicKey.from_bytes(b"\4" + data), "64 bytes, x ‖ y without the leading 04"
         if len(data) in (33, 65):
             form = "33 bytes, compressed" if len(data) == 33 else "65 bytes, 04 ‖ x ‖ y"
             return sm2.PublicKey.from_bytes(data), form
+        return sm2.PublicKey.from_der(data), "DER, SubjectPublicKeyInfo"  # 91 bytes, 59 where compressed
     except InvalidKey:
-        pass
-    return None
+        return None
 
 
 def _of_private_key(key: sm2.PrivateKey, form: str, how: str, given: _Given) -> Reading:

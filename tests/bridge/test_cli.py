@@ -263,3 +263,11 @@ def test_without_the_bridge_packages_the_command_says_how_to_get_them() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "[bridge]" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_python_3_10_is_told_that_the_bridge_needs_a_newer_one() -> None:
+    script = "import sys; sys.version_info = (3, 10, 13); import smcrypto.sm2, rosbridge_eth"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1] == (
+        "ImportError: rosbridge_eth, the bridge, needs Python 3.11 or later; smcrypto, the library, does with 3.10"
+    )

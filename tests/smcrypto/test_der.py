@@ -52,6 +52,27 @@ def test_object_identifiers(dotted: str, encoded: str) -> None:
     assert one(bytes.fromhex(encoded), der.Reader.oid) == dotted
 
 
+def test_tags_are_those_of_x_680() -> None:
+    """Table 1; SEQUENCE and SET with the bit for constructed values (X.690, 8.1.2.5)."""
+    numbers = {
+        "BOOLEAN": 1, "INTEGER": 2, "BIT_STRING": 3, "OCTET_STRING": 4, "NULL": 5, "OID": 6, "ENUMERATED": 10,
+        "UTF8_STRING": 12, "SEQUENCE": 16 + 32, "SET": 17 + 32, "NUMERIC_STRING": 18, "PRINTABLE_STRING": 19,
+        "T61_STRING": 20, "IA5_STRING": 22, "UTC_TIME": 23, "GENERALIZED_TIME": 24, "VISIBLE_STRING": 26,
+        "UNIVERSAL_STRING": 28, "BMP_STRING": 30,
+    }  # fmt: skip
+    assert {name: getattr(der, name) for name in der.__all__ if name.isupper()} == numbers
+
+
+def test_a_length_of_four_bytes_is_read() -> None:
+    data = b"\x04\x84\x01\0\0\0" + bytes(1 << 24)
+    assert der.element(der.OCTET_STRING, bytes(1 << 24)) == data
+    assert one(data, der.Reader.octet_string) == bytes(1 << 24)
+
+
+def test_named_bits_of_16_bytes_are_read() -> None:
+    assert one(bytes.fromhex("031100" + "ff" * 16), der.Reader.named_bits) == frozenset(range(128))
+
+
 def test_named_bits_carry_no_trailing_zeros() -> None:
     # keyCertSign and cRLSign are bits 5 and 6: every CA certificate has these four bytes.
     assert der.named_bits({5, 6}) == bytes.fromhex("03020106")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import importlib.util
-import secrets
 from pathlib import Path
 from typing import Any
 
@@ -245,6 +244,16 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_a_points_64_bytes_are_no_signature() -> None:
-    for _ in range(20):
-        point = sm2.PrivateKey(secrets.randbelow(1000) + 1).public_key.to_bytes()[1:]
+    for d in range(1, 21):
+        point = sm2.PrivateKey.from_int(d).public_key.to_bytes()[1:]
         assert [reading.what for reading in diagnose(point).readings] == ["public key"]
+
+
+def test_bytes_that_begin_as_der_does_are_keys_all_the_same() -> None:
+    """One in 256 raw keys begins with 30, the tag of SEQUENCE."""
+    d = b"\x30" + bytes(range(200, 231))
+    assert [reading.what for reading in diagnose(d).readings] == ["private key"]
+    point = next(
+        xy for d in range(1, 5000) if (xy := sm2.PrivateKey.from_int(d).public_key.to_bytes()[1:])[0] == 0x30
+    )
+    assert [reading.what for reading in diagnose(point).readings] == ["public key"]

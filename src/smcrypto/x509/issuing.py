@@ -23,6 +23,7 @@ from smcrypto.x509.signed import SM2_WITH_SM3, instant, sign
 __all__ = ["CA_KEY_USAGE", "ENCRYPTION_KEY_USAGE", "SIGNING_KEY_USAGE", "issue", "self_signed"]
 
 CA_KEY_USAGE: Final = ("keyCertSign", "cRLSign")
+"""What `issue` writes for a CA by default."""
 SIGNING_KEY_USAGE: Final = ("digitalSignature", "nonRepudiation")
 """Of the first of a TLCP identity's two certificates; what `issue` writes for an end entity by default."""
 ENCRYPTION_KEY_USAGE: Final = ("keyEncipherment", "dataEncipherment", "keyAgreement")

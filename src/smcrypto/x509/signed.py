@@ -95,8 +95,7 @@ class Signed:
         return made
 
     def _read(self, body: der.Reader) -> None:
-        """Fill the fields of this class with what stands in the body."""
-        raise NotImplementedError
+        """Fill the fields of a class with what stands in the body: each class has its own."""
 
     def _fill(self, **fields: object) -> None:
         for name, value in fields.items():
