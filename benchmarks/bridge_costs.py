@@ -126,9 +126,15 @@ def rule(whole: bool) -> TopicRule:
     return TopicRule(TOPIC) if whole else TopicRule(TOPIC, fields=POSE_AND_TWIST)
 
 
-def stage_costs(who: Identities, folder: Path, records: int, per_chunk: int, whole: bool) -> dict[str, Any]:
-    """Milliseconds a record of each stage (processor, wall), both ends in one process; and the chunks made."""
-    watch = Stopwatch()
+def stage_costs(
+    who: Identities, folder: Path, records: int, per_chunk: int, whole: bool, *, watch: Stopwatch | None = None,
+    turn: int = TAKE,
+) -> dict[str, Any]:
+    """Milliseconds a record of each stage (processor, wall), both ends in one process; and the chunks made.
+
+    turn: messages between two turns of the network; by default as the robot's loop turns while messages come in.
+    """
+    watch = watch or Stopwatch()
     spool, inbox = who.spool(folder / "spool.sqlite"), SqliteInbox(folder / "inbox.sqlite", LEDGER, GIB, GIB)
     now = time.monotonic()
     capture, writer = Capture([rule(whole)], source_kind="bag"), who.writer(1.0, now)
@@ -177,7 +183,7 @@ def stage_costs(who: Identities, folder: Path, records: int, per_chunk: int, who
         with watch("robot: spool"):
             for chunk in closed:
                 spool.append(chunk)
-        if number % TAKE == 0:  # as the robot's loop turns while messages come in
+        if number % turn == 0:
             exchange(watch)
     while not sender.idle:
         exchange(watch)
@@ -208,8 +214,11 @@ def gas(chunks: list[Chunk]) -> float:
     return float(total)
 
 
-def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tuple[float, float]:
-    """Records a second from the source to the server's commit, and records in a chunk; two processes on loopback."""
+def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tuple[float, float, int]:
+    """From the source to the server's commit, two processes on loopback.
+
+    Records a second, records in a chunk, and lines in the inbox: the records, and those that open the stream.
+    """
     [sock] = server_sockets(("127.0.0.1", 0))
     port = sock.getsockname()[1]
     context = multiprocessing.get_context("fork")
@@ -237,7 +246,10 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     serving.join(10)
     if robot.captured < records:
         raise SystemExit(f"only {robot.captured} of {records} were captured: {robot.summary}")
-    return records / seconds, records / robot.chunks
+    inbox = SqliteInbox(folder / "inbox-2.sqlite", LEDGER, GIB, GIB)
+    stored = inbox.totals()[PLACE.tk].records
+    inbox.close()
+    return records / seconds, records / robot.chunks, stored
 
 
 def first_edition(folder: Path, records: int) -> dict[str, Any]:
@@ -287,7 +299,7 @@ def main() -> None:
     rates = []
     for whole in (False, True):
         with tempfile.TemporaryDirectory() as folder:
-            rate, per_chunk_ = throughput(who, Path(folder), options.records, whole)
+            rate, per_chunk_, _ = throughput(who, Path(folder), options.records, whole)
         rates.append({"fields": "all" if whole else "pose and twist", "records_per_second": rate})
         print(f"\nThrough loopback, robot and server as two processes, {rates[-1]['fields']}: {rate:,.0f} records/s, "
               f"{per_chunk_:.0f} records a chunk")

@@ -1,9 +1,10 @@
 """The paper's chain interaction, on a real network: each client registers once, writes four times, asks four times.
 
-    python benchmarks/chain_interaction.py [--clients N] [--period SECONDS] [--chain clique|anvil] [--json FILE]
+    python benchmarks/chain_interaction.py [--clients N] [--period SECONDS]
+                                           [--chain clique|ethash|anvil] [--dag FOLDER] [--json FILE]
 
-The chain is three geth nodes that sign by proof of authority (geth_network.py), or
-anvil. Eight processes make the requests, as in the paper. The operator
+The chain is three geth nodes that sign by proof of authority, or of which one
+mines (geth_network.py), or anvil. Eight processes make the requests, as in the paper. The operator
 registers and funds the clients; each client then writes records of 256 bytes
 with `setData` from its own account, and asks for each with `checkData`.
 
@@ -39,25 +40,27 @@ from rosbridge_eth.ledger.nodes import Anvil
 
 PROCESSES, WRITES, QUERIES, CONFIRMATIONS = 8, 4, 4, 3
 ETH = 10**18
-PATIENCE = 120.0
+PATIENCE = 400.0  # seconds; by proof of work, blocks may be a minute apart
 Times = dict[str, list[float]]
 KEYS = Keyring.from_mnemonic("test test test test test test test test test test test junk")  # of every test chain
 
 
 @contextmanager
-def network(kind: str, clients: int, period: int) -> Iterator[list[str]]:
-    """The URLs of its nodes."""
+def network(kind: str, clients: int, period: int, dag: Path | None = None) -> Iterator[list[str]]:
+    """The URLs of its nodes. As in the paper, ten accounts have 100 ETH each; the operator's is one of them."""
     with tempfile.TemporaryDirectory(prefix="interaction-") as folder:
-        if kind == "clique":
-            with geth_network.Network(Path(folder), {KEYS.operator.address: 10_000 * ETH}, period=period) as running:
-                running.await_blocks(3)
-                yield [node.url for node in running.nodes]
-        else:
+        if kind == "anvil":
             with Anvil.start(geth_network.free_ports(1)[0], block_time=period) as node:
-                node.fund(KEYS.operator.address, 10_000)
+                node.fund(KEYS.operator.address, 100)
                 for client in range(1, clients + 1):  # some of them are those that anvil makes rich
                     node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")
                 yield [node.url]
+            return
+        others = [geth_network.new_key().public_key.to_checksum_address() for _ in range(9)]
+        balances = dict.fromkeys([KEYS.operator.address, *others], 100 * ETH)
+        with geth_network.Network(Path(folder), balances, period=period, gas_limit=0xFFFFFFFF, dag=dag) as running:
+            running.await_blocks(3)
+            yield [node.url for node in running.nodes]
 
 
 class Requests:
@@ -104,16 +107,16 @@ def record(client: int, number: int) -> bytes:
     return (f"{client}/{number} ".encode() * 64)[:256]
 
 
-def write_and_ask(url: str, address: str, clients: list[int]) -> Times:
-    """One of the eight processes."""
+def write_and_ask(url: str, address: str, clients: dict[int, int]) -> Times:
+    """One of the eight processes. clients: with the nonce that each begins at."""
     times: Times = defaultdict(list)
     ledger = Ledger(url, address)
     requests = Requests(ledger, times)
     for number in range(WRITES):
-        for client in clients:
+        for client, start in clients.items():
             tail = keccak(record(client, number - 1)) if number else NOTHING
             data = ledger.calldata("setData", robot_id(f"client_{client}"), number, tail, [record(client, number)])
-            requests.send(KEYS.robot(client), number, data, set_data_gas([256]))
+            requests.send(KEYS.robot(client), start + number, data, set_data_gas([256]))
         requests.settle()
     for number in range(QUERIES):
         for client in clients:
@@ -126,33 +129,36 @@ def write_and_ask(url: str, address: str, clients: list[int]) -> Times:
     return dict(times)
 
 
-def measure(kind: str, clients: int, period: int) -> dict[str, Times]:
-    """{"registration": ..., "use": ...}."""
-    with network(kind, clients, period) as urls:
-        ledger, _ = Ledger.deploy(urls[0], KEYS.operator)
-        times: Times = defaultdict(list)
-        requests, nonce = Requests(ledger, times), ledger.nonces([KEYS.operator.address])[0][0]
-        # Each registration first: money goes to registered accounts alone, and not above 5 ETH.
-        for function, value in (("registration", 0), ("allocETH", ETH // 10)):
-            for client in range(1, clients + 1):
-                address = KEYS.robot(client).address
-                data = (ledger.calldata(function, robot_id(f"client_{client}"), address, b"certificates")
-                        if function == "registration" else ledger.calldata(function, address))
-                requests.send(KEYS.operator, nonce, data, call_gas(data), value)
-                nonce += 1
-            requests.settle()
-            if function == "registration":
-                registered = {name: list(values) for name, values in times.items()}
-        shares = [list(range(1 + process, clients + 1, PROCESSES)) for process in range(PROCESSES)]
-        with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
-            parts = pool.starmap(write_and_ask, [
-                (urls[number % len(urls)], ledger.contract, share) for number, share in enumerate(shares) if share
-            ])
-        use: Times = defaultdict(list)
-        for part in parts:
-            for name, values in part.items():
-                use[name] += values
-        return {"registration": registered, "use": dict(use)}
+def measure(urls: list[str], clients: int) -> dict[str, Times]:
+    """{"registration": ..., "use": ...}; the contract is a new one."""
+    ledger, _ = Ledger.deploy(urls[0], KEYS.operator, wait=PATIENCE)
+    times: Times = defaultdict(list)
+    requests, nonce = Requests(ledger, times), ledger.nonces([KEYS.operator.address])[0][0]
+    starts = {client: start for client, (start, _) in enumerate(
+        ledger.nonces([KEYS.robot(client).address for client in range(1, clients + 1)]), 1)}  # fmt: skip
+    # Each registration first: money goes to registered accounts alone, and not above 5 ETH.
+    for function, value in (("registration", 0), ("allocETH", ETH // 10)):
+        for client in range(1, clients + 1):
+            address = KEYS.robot(client).address
+            data = (ledger.calldata(function, robot_id(f"client_{client}"), address, b"certificates")
+                    if function == "registration" else ledger.calldata(function, address))
+            requests.send(KEYS.operator, nonce, data, call_gas(data), value)
+            nonce += 1
+        requests.settle()
+        if function == "registration":
+            registered = {name: list(values) for name, values in times.items()}
+    shares = [list(range(1 + process, clients + 1, PROCESSES)) for process in range(PROCESSES)]
+    with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
+        parts = pool.starmap(write_and_ask, [
+            (urls[number % len(urls)], ledger.contract, {client: starts[client] for client in share})
+            for number, share in enumerate(shares) if share
+        ])
+    ledger.close()
+    use: Times = defaultdict(list)
+    for part in parts:
+        for name, values in part.items():
+            use[name] += values
+    return {"registration": registered, "use": dict(use)}
 
 
 def report(kind: str, clients: int, found: dict[str, Times]) -> str:
@@ -177,11 +183,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--clients", type=int, default=100)
     parser.add_argument("--period", type=int, default=1, help="seconds between blocks")
-    parser.add_argument("--chain", choices=["clique", "anvil"], default="clique")
+    parser.add_argument("--chain", choices=["clique", "ethash", "anvil"], default="clique")
+    parser.add_argument("--dag", type=Path, default=Path(".dag"), help="ethash's 1 GB, made here if it is not there")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     try:
-        found = measure(options.chain, options.clients, options.period)
+        if dag := options.dag if options.chain == "ethash" else None:
+            geth_network.make_dag(dag)
+        with network(options.chain, options.clients, options.period, dag) as urls:
+            found = measure(urls, options.clients)
     except geth_network.Unavailable as reason:
         print(reason, file=sys.stderr)
         return 1

@@ -67,6 +67,10 @@ def free_ports(count: int) -> list[int]:
     return found
 
 
+def new_key() -> PrivateKey:
+    return PrivateKey(os.urandom(32))
+
+
 def genesis(signers: list[str], balances: Mapping[str, int], period: int, gas_limit: int) -> dict[str, Any]:
     """The first block of a network with London's rules, where these may sign, one block every `period` seconds.
 
@@ -178,7 +182,7 @@ class Network:
         dag: Path | None = None, miners: int = 1,
     ) -> None:  # fmt: skip
         program = find_geth("clique" if dag is None else "ethash")
-        keys = [PrivateKey(os.urandom(32)) for _ in range(nodes)]
+        keys = [new_key() for _ in range(nodes)]
         shared = {"miner.gaslimit": gas_limit}
         signing = shared | {"mine": None}
         mining = signing | {"miner.threads": 1, "ethash.dagdir": dag, "ethash.dagsinmem": 0, "ethash.dagsondisk": 1,
