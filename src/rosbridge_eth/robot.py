@@ -18,6 +18,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from socket import socket as Socket
 from typing import TypeVar
 
@@ -25,9 +26,9 @@ from rosbridge_eth.capture import Capture, Captured, Decoder, RawMessage, TopicR
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
-from rosbridge_eth.config import RobotConfig
+from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.values import parse_address, time_text
-from rosbridge_eth.errors import ConfigError, StoreError
+from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.logs import Trouble
@@ -102,6 +103,13 @@ class Robot:
         """Let `run` come to an end, from any thread or a signal handler; what is not stored stays in the spool."""
         self._stop.set()
         self.loop.wake()
+
+    def take_up(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
+        """Go on by other topics, nodes and [capture], and seal for these readers; to be called in the loop's thread."""
+        self._add_losses(time.monotonic())
+        self.capture.take_up(config.rules())
+        self.source.watch(config.selection())
+        self.writer.take_up(readers)
 
     def begin_stream(self, refused: bytes) -> None:
         """The server refused a stream: if it is the one being written, go on in a new one."""
@@ -344,6 +352,24 @@ def open_robot(
     )  # fmt: skip
     client.connect(address, now)
     return robot
+
+
+def read_again(robot: Robot, home: RobotHome, running: RobotConfig, file: Path) -> RobotConfig:
+    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, [capture] and
+    readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from now on.
+
+    What cannot be used is told, and nothing changes.
+    """
+    keys = [*(("topics", "nodes") if robot.source.live else ()), "capture", "readers"]
+    try:
+        config, said = reread(running, load_robot_config(file), keys)
+        roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
+        robot.take_up(config, reader_keys(config, home, roots))
+    except (BridgeError, OSError) as error:
+        log.error("nothing is taken up: %s", error)
+        return running
+    log.warning("%s", said)
+    return config
 
 
 def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> None:

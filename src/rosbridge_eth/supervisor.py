@@ -15,8 +15,8 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from socket import AF_UNIX, SOCK_CLOEXEC, SOCK_DGRAM
@@ -28,6 +28,7 @@ from rosbridge_eth.administration import server_trust
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
+from rosbridge_eth.config import load_server_config, reread
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
 from rosbridge_eth.identity import Identity, Role
@@ -52,6 +53,9 @@ SHORT_LIFE = 5.0  # seconds; a process that lived longer began its work
 GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
 PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
 """Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
+
+TAKEN_UP = ("channel", "chain", "store", "funds", "limits")
+"""Keys of server.toml that SIGHUP takes up: those that the parent, its sockets and certificates do not rest on."""
 
 SUBMITTER, MONITOR = "submitter", "monitor"
 _FORK = multiprocessing.get_context("fork")
@@ -142,7 +146,7 @@ def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Reg
 
 
 class Supervisor:
-    """Runs a server until `stop`, SIGTERM, SIGINT or SIGHUP."""
+    """Runs a server until `stop`, SIGTERM, SIGINT, or its terminal is gone; SIGHUP: server.toml is read again."""
 
     def __init__(self, home: OperatorHome, config: Settings, secrets: Secrets) -> None:
         self._home, self._config, self._secrets = home, config, secrets
@@ -152,7 +156,8 @@ class Supervisor:
         self._starts: Counter[str] = Counter()
         self._due: dict[str, float] = {}  # processes that ended, and when they are started again
         self._short_lives: dict[str, int] = {}
-        self._stop = threading.Event()
+        self._stop, self._again = threading.Event(), threading.Event()
+        self._at_terminal = os.isatty(2)
         self._pid = os.getpid()
 
     def stop(self) -> None:
@@ -164,7 +169,7 @@ class Supervisor:
         Raises BridgeError before the port is open, and ProcessError where a process does not come up however often
         it is started. on_ready: called with the address that is listened on.
         """
-        self._check()
+        self._check(self._config)
         with _shared_figures():
             self._run(on_ready)
 
@@ -184,30 +189,47 @@ class Supervisor:
             on_ready((host, port))
             notify("READY=1")
             while not self._stop.wait(WATCH):
+                if self._again.is_set():
+                    self._again.clear()
+                    self._read_again(tasks)
                 self._look(tasks, time.monotonic())
                 notify("WATCHDOG=1")
         finally:
             notify("STOPPING=1")
-            self._end()
+            self._end(self._children)
             for sock in sockets:
                 sock.close()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self.stop()
+        if number == signal.SIGHUP and os.isatty(2) == self._at_terminal:
+            self._again.set()
+        else:
+            self.stop()
 
-    def _check(self) -> None:
+    def _read_again(self, tasks: dict[str, Callable[[], None]]) -> None:
+        """Replace workers and submitter by such that go by what changed in server.toml; the port stays open, and
+        robots make new sessions. What cannot be used is told, and nothing changes."""
+        try:
+            config, said = reread(self._config, load_server_config(self._home.config), TAKEN_UP)
+            self._check(config)
+        except BridgeError as error:
+            log.error("nothing is taken up: %s", error)
+            return
+        self._config = config
+        log.warning("%s", said)
+        names = [name for name in self._children if name != MONITOR]
+        self._end(names)
+        for name in names:
+            self._due.pop(name, None)
+            self._start(name, tasks[name])
+
+    def _check(self, config: Settings) -> None:
         """The chain is the right one and the store keeps what it is given: only then may a robot be answered."""
         Registry(self._home.registry).close()
-        ledger = Ledger.connect(self._config.chain.url, self._deployment)
-        try:
+        with closing(Ledger.connect(config.chain.url, self._deployment)) as ledger:
             ledger.check()
-        finally:
-            ledger.close()
-        inbox = open_store(self._config, self._home)
-        try:
+        with closing(open_store(config, self._home)) as inbox:
             inbox.check()
-        finally:
-            inbox.close()
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
         self._starts[name] += 1
@@ -243,11 +265,12 @@ class Supervisor:
             )
         return float(min(LONGEST_PAUSE, FIRST_PAUSE * 2 ** max(0, short - 1)))
 
-    def _end(self) -> None:
-        for process in self._children.values():
-            process.terminate()
+    def _end(self, names: Collection[str]) -> None:
+        for name in names:
+            self._children[name].terminate()
         deadline = time.monotonic() + GRACE
-        for name, process in self._children.items():
+        for name in names:
+            process = self._children[name]
             process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():
                 log.error("%s does not end; it is killed", name)

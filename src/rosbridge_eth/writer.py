@@ -62,6 +62,12 @@ class LogWriter:
         self._defined: set[str] = set()
         self._begun = self._now
 
+    def take_up(self, readers: Sequence[sm2.PublicKey]) -> None:
+        """Seal the next chunk, and all after it, for these; definitions are said again, for who reads from there on."""
+        if self._readers != tuple(readers):
+            self._readers = tuple(readers)
+            self._defined.clear()
+
     def add(
         self, line: bytes, now: float, *,
         type_name: str | None = None, definition_line: Callable[[], bytes] | None = None,

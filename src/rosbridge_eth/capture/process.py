@@ -88,12 +88,21 @@ class Capture:
 
     def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
-        self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
-        self._selections = {id(rule): parse_paths(rule.fields) if rule.fields else EVERYTHING for rule in rules}
         self._topics: dict[str, _Topic | None] = {}
         self._source_kind = source_kind
         self._live = live
         self._declared: dict[tuple[str, str], int] = {}  # losses that are in a line already, by topic and why
+        self.take_up(rules)
+
+    def take_up(self, rules: Sequence[TopicRule]) -> None:
+        """Go on by other rules. A topic whose rule stays the same goes on as it is; of others the counts begin anew,
+        so `lost` is asked before. Raises ValueError."""
+        self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
+        self._selections = {id(rule): parse_paths(rule.fields) if rule.fields else EVERYTHING for rule in rules}
+        self._topics = {name: topic for name, topic in self._topics.items()
+                        if topic is not None and topic.rule == rule_for(name, self._rules)}  # fmt: skip
+        self._declared = {(name, why): count for (name, why), count in self._declared.items()
+                          if name in self._topics or why not in set(Cause)}  # fmt: skip
 
     def process(self, raw: RawMessage, wall_ns: int, clock_synchronised: bool = False) -> Captured | None:
         """The record of a message, or None if it is not due, refused or cannot be decoded.

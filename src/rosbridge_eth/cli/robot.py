@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -74,27 +75,40 @@ def robot(
     verbose: Verbose = 0,
     log_format: LogFormatOption = LogFormat.TEXT,
 ) -> None:
-    """Watch the configured topics and bring what they say to the server, until stopped or the source ends."""
+    """Watch the configured topics and bring what they say to the server, until stopped or the source ends.
+
+    SIGHUP: topics, nodes, [capture] and readers are read again.
+    """
     from rosbridge_eth import metrics
-    from rosbridge_eth.robot import open_robot
+    from rosbridge_eth.robot import open_robot, read_again
     from rosbridge_eth.supervisor import Beats, notify
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
     end = place.bridge()
-    settings = load_robot_config(config or place.config)
+    file = config or place.config
+    settings = load_robot_config(file)
     source, why = settings.source_and_why(os.environ)
     talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
     running = open_robot(place, settings, read_passphrase("robot", f"Password of {end.robot}", file=password_file))
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        running.stop()
+    again, terminal = threading.Event(), os.isatty(2)
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGHUP and os.isatty(2) == terminal:
+            again.set()
+        else:  # also of a terminal that is gone
+            running.stop()
 
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, stop)
+        signal.signal(number, on_signal)
     beats = Beats()
 
     def on_turn() -> None:
+        nonlocal settings
+        if again.is_set():
+            again.clear()
+            settings = read_again(running, place, settings, file)
         if beats.due():
             notify("WATCHDOG=1")
             metrics.show_robot(end.robot, running, time.time())

@@ -1,6 +1,6 @@
 """Configuration: TOML files to checked values, with errors that say what to change."""
 
-from rosbridge_eth.config.loading import load_reader_config, load_robot_config, load_server_config, parse_config
+from rosbridge_eth.config.loading import load_reader_config, load_robot_config, load_server_config, parse_config, reread
 from rosbridge_eth.config.models import ReaderConfig, RobotConfig, ServerConfig, TopicConfig
 from rosbridge_eth.config.values import Address
 
@@ -14,4 +14,5 @@ __all__ = [
     "load_robot_config",
     "load_server_config",
     "parse_config",
+    "reread",
 ]

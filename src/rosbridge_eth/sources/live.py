@@ -52,6 +52,9 @@ class LiveSource(Source):
         self._said: dict[str, None] = {}
         self._lock = threading.RLock()  # of the counts and of what was said
 
+    def watch(self, selection: Selection) -> None:
+        self._selection = selection
+
     @abstractmethod
     def _receive(self) -> None:
         """Put what arrives into the backlog until `_ending` is set; in the thread that receives."""

@@ -58,6 +58,10 @@ class Source(Protocol):
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Emit messages in receive order until the source ends or `stop` is set. Raises SourceError."""
 
+    def watch(self, selection: Selection) -> None:
+        """Watch what this names instead; only a live source does, which looks every few seconds."""
+        return
+
     def close(self) -> None:
         """Release files and sockets. May be called twice."""
 

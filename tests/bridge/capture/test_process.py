@@ -186,3 +186,22 @@ def test_a_malformed_rule_is_refused_at_once():
         Capture([TopicRule("/a b")])
     with pytest.raises(ValueError, match="is not a field path"):
         Capture([TopicRule("/a", fields=("x..y",))])
+
+
+def test_other_rules_leave_what_is_unchanged_as_it_is_and_lose_no_count():
+    capture = Capture([TopicRule("/once", once=True), TopicRule("/n"), TopicRule("/b", oversize="refuse", limit=10)])
+    for topic in ("/once", "/n"):
+        assert capture.process(number(1, topic=topic), 0) is not None
+    assert capture.process(blob(11), 0) is None
+    assert len(capture.lost({("/n", "dropped"): 2})) == 2
+    capture.take_up([TopicRule("/once", once=True), TopicRule("/b", limit=10), TopicRule("/new", fields=("x",))])
+    assert capture.process(number(2, topic="/once"), 0) is None, "its one message was captured before"
+    assert capture.process(number(2), 0) is None
+    assert capture.process(blob(11), 0) is not None, "by the new rule, a digest"
+    captured = capture.process(number(2, topic="/new"), 0)
+    assert captured is not None and captured.data == {"x": 2}
+    assert capture.lost({("/n", "dropped"): 2}) == [], "nothing is said twice"
+    capture.take_up([TopicRule("/b", oversize="refuse", limit=10)])
+    assert capture.process(blob(11), 0) is None
+    [line] = capture.lost({("/n", "dropped"): 2})
+    assert parse_line(line) == LostLine(1, "/b", "field_too_large")

@@ -18,12 +18,14 @@ from rosbridge_eth.chunk import (
     MAX_RECORDS,
     MAX_TIME_MS,
     Chunk,
+    NoGrant,
     TooLarge,
     content_key,
     open_lines,
     verify,
 )
 from rosbridge_eth.writer import MAX_JSON, LogWriter
+from smcrypto import sm2
 
 STREAM_LINE = b'{"stream":{"source":"sim"}}'
 ZEROS = bytes(32)
@@ -330,3 +332,23 @@ def test_a_repr_shows_no_line():
     made = writer()
     made.add(b"secret", 0.0)
     assert "secret" not in repr(made) and "1 lines" in repr(made)
+
+
+def test_a_new_reader_opens_the_next_chunk_and_finds_the_definitions_in_it():
+    made, late = started(), sm2.PrivateKey.generate()
+
+    def chunk(now: float) -> Chunk:
+        made.add(message(0), now - 1, type_name="T", definition_line=lambda: b'{"type":"T"}')
+        [closed] = made.closed(now, 0)
+        return closed
+
+    assert read(chunk(2.0)) == (b'{"type":"T"}', message(0))
+    made.take_up([READER.public_key])
+    assert read(chunk(4.0)) == (message(0),), "nothing is said again where nothing changed"
+    made.take_up([READER.public_key, late.public_key])
+    both = chunk(6.0)
+    assert read(both) == (b'{"type":"T"}', message(0))
+    assert open_lines(LOG, both, content_key(both.header, late)) == read(both)
+    made.take_up([late.public_key])
+    with pytest.raises(NoGrant):
+        read(chunk(8.0))

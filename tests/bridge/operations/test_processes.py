@@ -202,8 +202,8 @@ def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: B
         assert {f["what"]: f["result"] for f in findings}["server"] == "skipped"
         assert {f["what"]: f["result"] for f in findings}["monitor"] == "ok"
     finally:
-        robot.send_signal(signal.SIGHUP)
-    assert robot.wait(30) == 0, "SIGHUP is an orderly end"
+        robot.send_signal(signal.SIGINT)
+    assert robot.wait(30) == 0
     assert bridge.said("robot.log", "records captured in") == 2
     bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
     verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
@@ -260,7 +260,41 @@ def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bri
     bridge.until("ready again", bridge.ready)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_sighup_takes_up_server_toml_and_the_robots_go_on(bridge: Bridge):
+    assert bridge.server is not None
+    bridge.until("ready at first", bridge.ready)
+    robot = bridge.start_robot('kind = "sim"')
+    bridge.until("a session", lambda: bridge.figures()["channel connections"] == 1)
+    config = bridge.path / "operator" / "server.toml"
+    good, before = config.read_text(), bridge.figures()["starts"]
+    try:
+        config.write_text(good.replace("[chain]", "[chain]\nconfirmations = 0"))
+        bridge.server.send_signal(signal.SIGHUP)
+        bridge.until("refused", lambda: bridge.said("server.log", "nothing is taken up") == 1)
+        assert bridge.figures()["starts"] == before
+        config.write_text(good.replace("[chain]", "workers = 3\n[limits]\nconnections = 0\n[chain]"))
+        config.write_text(good.replace("[chain]", "workers = 3\n[chain]\nconfirmations = 2"))
+        bridge.server.send_signal(signal.SIGHUP)
+        bridge.until("taken up", lambda: bridge.said("server.log", "taken up: channel, chain,") == 1)
+        assert bridge.said("server.log", "holds from the next start on: workers") == 1
+        bridge.until("other processes", lambda: bridge.figures()["starts"] == before + 3)
+        bridge.until("ready", bridge.ready)
+        bridge.until("the session again", lambda: bridge.figures()["channel connections"] == 1)
+        stored = bridge.figures()["records_stored robot_1"]
+        bridge.until("what follows", lambda: bridge.figures()["records_stored robot_1"] > stored)
+        assert bridge.figures()["waiting_chunks robot_1"] > 0, "two confirmations: the last block's are not confirmed"
+    finally:
+        config.write_text(good)
+        robot.terminate()
+    assert robot.wait(30) == 0
+    bridge.server.send_signal(signal.SIGHUP)
+    bridge.until("as before", lambda: bridge.said("server.log", "taken up: channel, chain,") == 2)
+    bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
+    verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
+    assert verdict["sound"] and verdict["head"]["goodbye"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Bridge, number: signal.Signals):
     assert bridge.server is not None
     bridge.until("ready at first", bridge.ready)
