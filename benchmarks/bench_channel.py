@@ -22,7 +22,7 @@ from pathlib import Path
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message, Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.channel.wire import SEGMENT_SIZE, Hello
+from rosbridge_eth.channel.wire import HELLO_PADDING, SEGMENT_SIZE, Hello, Kind
 from smcrypto import sm3, sm4
 
 HERE, THERE = ("192.0.2.7", 50000), ("192.0.2.1", 4433)
@@ -146,12 +146,12 @@ def loopback(megabytes: float) -> None:
     os.waitpid(child, 0)
     print(f"  the robot's process worked           {worked:8.2f} s, {megabytes / worked:5.2f} MB/s of its time")
     print(f"  {count} chunks, each answered, took {took:10.2f} s, {megabytes / took:5.2f} MB/s, "
-          f"{counted.packets_lost} packets lost")
+          f"{counted['packets_lost']} packets lost")
 
 
 def client_gone(server: Server) -> bool:
     counted = server.statistics()
-    return counted.handshakes > 0 and counted.connections == 0
+    return counted["handshakes"] > 0 and counted["connections"] == 0
 
 
 def each(call: Callable[[], object], count: int) -> float:
@@ -183,7 +183,7 @@ def ciphers() -> None:
 def strangers() -> None:
     server = make_server()
     print("\nwhat a stranger costs the server, µs")
-    hello = Hello(Mode.EXCHANGE, os.urandom(8), os.urandom(32)).to_bytes()
+    hello = Hello(Mode.EXCHANGE, os.urandom(8), os.urandom(16)).datagram(Kind.HELLO, HELLO_PADDING)
 
     def offered(data: bytes) -> Callable[[], object]:
         def deliver() -> None:
@@ -191,7 +191,7 @@ def strangers() -> None:
             server.datagrams_to_send(1.0)
         return deliver
 
-    forged = b"\x03" + hello[1:43] + os.urandom(24) + b"\0\1" + bytes(1000)
+    forged = b"\x03" + hello[1:27] + os.urandom(24) + b"\0\1" + bytes(1000)
     print(f"  a HELLO, answered by a cookie      {each(offered(hello), 2000):8.1f}")
     print(f"  a PROOF with a cookie made up      {each(offered(forged), 2000):8.1f}")
     print(f"  1,200 bytes of noise               {each(offered(b'X' + os.urandom(1199)), 2000):8.1f}")

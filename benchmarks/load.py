@@ -55,7 +55,7 @@ from rosbridge_eth import server as door
 from rosbridge_eth.administration import deploy_contract, init_home, load_server_identity, register_robot
 from rosbridge_eth.bundle import Request, read_bundle
 from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
-from rosbridge_eth.channel import Client, ClientConfig
+from rosbridge_eth.channel import Client, ClientConfig, Drop
 from rosbridge_eth.channel.protection import Direction
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
@@ -273,8 +273,9 @@ class Operator:
         worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
         before = resident_kib()
         worker.run(stopped)
+        drops = {str(what): n for what, n in reception.server.statistics().items() if isinstance(what, Drop)}
         report.send({
-            "opening": opening, "verifying": verifying, "dropped": dict(reception.server.statistics().dropped),
+            "opening": opening, "verifying": verifying, "dropped": drops,
             "before": before, "peak": peak_kib(),
         })  # fmt: skip
 
@@ -505,7 +506,7 @@ def client_process(
         "sent": sum(session.sender.statistics.sent for session in sessions),
         "refused": sum(session.sender.statistics.refused for session in sessions),
         "reconnected": sum(session.sender.statistics.sessions - 1 for session in sessions),
-        "retransmitted": sum(session.client.statistics().retransmitted for session in sessions),
+        "retransmitted": sum(session.client.statistics()["retransmitted"] for session in sessions),
     })  # fmt: skip
     report.recv()
     for session in sessions:

@@ -188,7 +188,7 @@ def shake_hands(
         loop.step(0.0)
     finally:
         loop.close()
-    return events, client.statistics().datagrams_received
+    return events, client.statistics()["datagrams_received"]
 
 
 def chain(ledger: Ledger) -> Findings:

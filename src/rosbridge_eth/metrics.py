@@ -14,7 +14,6 @@ import socket
 import threading
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import fields
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -24,7 +23,7 @@ from prometheus_client import CollectorRegistry, Gauge
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, ThreadingWSGIServer, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 
-from rosbridge_eth.channel import Statistics
+from rosbridge_eth.channel import Drop
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.inbox import Inbox, Waiting
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
@@ -187,14 +186,9 @@ class Web:
 # What each process shows of itself, once a second
 
 
-def show_channel(process: str, counted: Statistics, lost_sends: int) -> None:
-    for field in fields(counted):
-        value = getattr(counted, field.name)
-        if field.name == "dropped":
-            for reason, count in value.items():
-                DROPPED.labels(process, reason).set(count)
-        else:
-            CHANNEL.labels(process, field.name).set(value)
+def show_channel(process: str, counted: Mapping[str, int], lost_sends: int) -> None:
+    for what, count in counted.items():
+        (DROPPED if isinstance(what, Drop) else CHANNEL).labels(process, what).set(count)
     CHANNEL.labels(process, "lost_sends").set(lost_sends)
 
 

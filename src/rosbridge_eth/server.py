@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from rosbridge_eth import protocol
-from rosbridge_eth.channel import AddressChanged, Connected, Disconnected, End, Event, Message, Server
+from rosbridge_eth.channel import Connected, Disconnected, End, Event, Message, Server
 from rosbridge_eth.channel.udp import UdpLoop
 from rosbridge_eth.chunk import Altered, Chunk, ChunkError, Forged, Log, robot_id, verify
 from rosbridge_eth.errors import StoreError
@@ -98,8 +98,6 @@ class Reception:
                     log.info("%s: session ended, %s", ended.peer, reason)
                     if reason is End.REPLACED:
                         self._gone[ended.peer.name] = ended
-            case AddressChanged(peer=peer):
-                log.info("%s: goes on from another address", peer)
             case Message(connection=connection, payload=payload):
                 found = self.sessions.get(connection)
                 if found is not None:
@@ -111,7 +109,7 @@ class Reception:
             message = protocol.decode_up(payload)
         except ProtocolError as error:
             log.warning("%s: %s; its session is closed", session.peer, error)
-            self.server.close_connection(session.connection, now, End.PROTOCOL)
+            self.server.close_connection(session.connection, End.PROTOCOL)
             return
         match message:
             case Where(stream=stream):
@@ -138,7 +136,7 @@ class Reception:
         except ChunkError as error:
             self.counts["malformed"] += 1
             log.warning("%s: sends what is no chunk (%s); its session is closed", session.peer, error)
-            self.server.close_connection(session.connection, now, End.PROTOCOL)
+            self.server.close_connection(session.connection, End.PROTOCOL)
             return None
         try:
             verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, chunk)
@@ -191,7 +189,7 @@ class Reception:
             outcomes = self._inbox.append(chunks, wall)
         except InboxExchanged as error:  # what robots were told is void: they ask again in a new session
             log.error("%s; all sessions begin anew", error)
-            self.server.close(now)
+            self.server.close()
             self.sessions.clear()
             return None
         except StoreError as error:
@@ -244,7 +242,7 @@ class Reception:
         for session in list(self.sessions.values()):
             if not self._allowed(session.peer):
                 log.warning("%s is no longer allowed; its session is closed", session.peer)
-                self.server.close_peer(session.peer.name, now, role=session.peer.role)
+                self.server.close_peer(session.peer.name)
                 continue
             try:
                 state = self._inbox.state(session.tk)
@@ -281,7 +279,7 @@ class Reception:
             self.server.send(session.connection, encoded)
         else:  # it takes none of our packets: it comes back with a new session, and asks
             log.warning("%s: takes no answers; its session is closed", session.peer)
-            self.server.close_connection(session.connection, time.monotonic())
+            self.server.close_connection(session.connection)
 
     def _compare(self, session: Session, before: Session | None, now: float) -> None:
         """A session that took the place of a living one: perhaps two machines have one identity."""
@@ -307,6 +305,6 @@ class Worker:
             self.reception.turn(time.monotonic(), time.time())
             on_turn()
         self.reception.commit(time.monotonic(), time.time())
-        self.reception.server.close(time.monotonic())
+        self.reception.server.close()
         self.loop.step(0.0)
         self.loop.close()

@@ -7,8 +7,6 @@ sockets under them.
 from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.client import Client
 from rosbridge_eth.channel.events import (
-    AddressChanged,
-    ChannelConfig,
     ClientConfig,
     Connected,
     Disconnected,
@@ -20,14 +18,12 @@ from rosbridge_eth.channel.events import (
     Message,
     NotConnected,
     ServerConfig,
-    Statistics,
 )
 from rosbridge_eth.channel.handshake import Randomness
 from rosbridge_eth.channel.server import Server, cookie_key
 from rosbridge_eth.channel.wire import Mode, Reason
 
 __all__ = [
-    "Address", "AddressChanged", "ChannelConfig", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End",
-    "Event", "Full", "HandshakeFailed", "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server",
-    "ServerConfig", "Statistics", "cookie_key",
+    "Address", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End", "Event", "Full", "HandshakeFailed",
+    "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server", "ServerConfig", "cookie_key",
 ]  # fmt: skip

@@ -24,8 +24,6 @@ class Cookies:
     A cookie is the time (8 bytes, ms) and a keyed hash of it, the address, and the HELLO's fields.
     """
 
-    __slots__ = ("_key", "lifetime")
-
     def __init__(self, key: bytes, lifetime: float) -> None:
         if len(key) != 32:
             raise ValueError(f"the cookie key must be 32 bytes, not {len(key)}")
@@ -44,9 +42,7 @@ class Cookies:
     def holds(self, cookie: bytes, address: Address, hello: Hello, now: float) -> bool:
         stamp = cookie[:8]
         age = now - int.from_bytes(stamp, "big") / 1000
-        if not -0.001 <= age <= self.lifetime:
-            return False
-        return hmac.compare_digest(cookie[8:], self._hash(stamp, address, hello))
+        return -0.001 <= age <= self.lifetime and hmac.compare_digest(cookie[8:], self._hash(stamp, address, hello))
 
 
 class TokenBucket:
@@ -55,10 +51,7 @@ class TokenBucket:
     __slots__ = ("_at", "burst", "level", "rate")
 
     def __init__(self, rate: float, burst: float, now: float) -> None:
-        self.rate = rate
-        self.burst = burst
-        self.level = burst
-        self._at = now
+        self.rate, self.burst, self.level, self._at = rate, burst, burst, now
 
     def available(self, now: float) -> float:
         if now > self._at:
@@ -81,12 +74,8 @@ class Sources:
     behind one address are not slowed down; what fails is.
     """
 
-    __slots__ = ("_buckets", "burst", "capacity", "rate")
-
     def __init__(self, rate: float, burst: float, capacity: int) -> None:
-        self.rate = rate
-        self.burst = burst
-        self.capacity = capacity
+        self.rate, self.burst, self.capacity = rate, burst, capacity
         self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
 
     def __len__(self) -> int:

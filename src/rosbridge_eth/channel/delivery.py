@@ -21,27 +21,22 @@ MAX_PTO = 4.0  # s: after an outage the path is tried at least this often
 
 
 class RoundTrip:
-    """RTT estimate (RFC 9002, 5.3), in seconds."""
+    """RTT estimate (RFC 9002, 5.3), in seconds. What the peer waits before it acknowledges is taken as part of it."""
 
-    __slots__ = ("latest", "minimum", "smoothed", "variance")
+    __slots__ = ("latest", "smoothed", "variance")
 
     def __init__(self, sample: float | None = None) -> None:
-        self.latest = self.minimum = 0.0
-        self.smoothed, self.variance = INITIAL_RTT, INITIAL_RTT / 2
+        self.latest, self.smoothed, self.variance = 0.0, INITIAL_RTT, INITIAL_RTT / 2
         if sample is not None:
-            self.update(sample, 0.0)
+            self.update(sample)
 
-    def update(self, sample: float, ack_delay: float) -> None:
-        self.latest = sample = max(sample, 1e-6)
-        if not self.minimum:
-            self.minimum = self.smoothed = sample
-            self.variance = sample / 2
-            return
-        self.minimum = min(self.minimum, sample)
-        if sample - ack_delay >= self.minimum:
-            sample -= ack_delay
-        self.variance += (abs(self.smoothed - sample) - self.variance) / 4
-        self.smoothed += (sample - self.smoothed) / 8
+    def update(self, sample: float) -> None:
+        if self.latest:
+            self.variance += (abs(self.smoothed - sample) - self.variance) / 4
+            self.smoothed += (sample - self.smoothed) / 8
+        else:
+            self.smoothed, self.variance = sample, sample / 2
+        self.latest = max(sample, 1e-6)
 
     def pto(self, max_ack_delay: float, count: int = 0) -> float:
         """How long to wait for an acknowledgement after `count` probes went unanswered (6.2)."""
@@ -53,6 +48,7 @@ class RoundTrip:
 
 
 INITIAL_WINDOW = 16 * DATAGRAM_SIZE
+MAX_WINDOW = 512 * 1024
 MINIMUM_WINDOW = 2 * DATAGRAM_SIZE
 QUEUE_SHARE = 4 * DATAGRAM_SIZE
 """What each sender adds to a queue that is long enough: it makes those that share one come to equal windows."""
@@ -80,7 +76,7 @@ class Window:
         "_round_rtt", "limited", "maximum", "size",
     )  # fmt: skip
 
-    def __init__(self, now: float, maximum: int) -> None:
+    def __init__(self, now: float, maximum: int = MAX_WINDOW) -> None:
         self.size = min(INITIAL_WINDOW, maximum)
         self.maximum = maximum
         self.limited = False

@@ -27,9 +27,10 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from typing import NamedTuple
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import wire
@@ -49,7 +50,7 @@ NO_CONFIRMATION = bytes(CONFIRMATION_SIZE)
 class HandshakeRefused(Exception):
     """The peer's handshake message is not accepted; `hint` is what it may be told."""
 
-    def __init__(self, drop: Drop, why: str, hint: Reason | None = None) -> None:
+    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
         super().__init__(why)
         self.drop = drop
         self.hint = hint
@@ -70,13 +71,10 @@ def exchange_id(role: Role, encryption_certificate: bytes) -> bytes:
 
 def _exchange(mine: Identity, peer: PeerIdentity, ephemeral: sm2.PrivateKey, *, initiator: bool) -> sm2.KeyExchange:
     return sm2.KeyExchange(
-        mine.encryption_key,
-        exchange_id(mine.role, mine.encryption_certificate.to_der()),
-        peer.encryption_certificate.public_key,
-        exchange_id(peer.role, peer.encryption_certificate.to_der()),
-        initiator=initiator,
-        ephemeral_key=ephemeral,
-    )
+        mine.encryption_key, exchange_id(mine.role, mine.encryption_certificate.to_der()),
+        peer.encryption_certificate.public_key, exchange_id(peer.role, peer.encryption_certificate.to_der()),
+        initiator=initiator, ephemeral_key=ephemeral,
+    )  # fmt: skip
 
 
 def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
@@ -88,15 +86,23 @@ def _digest(transcript: sm3.SM3) -> bytes:
     return transcript.copy().digest()
 
 
-@dataclass(frozen=True, slots=True)
-class Agreed:
-    """What a client has when a handshake is done: who the server is, and the session's secrets."""
+def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], list[int]]:
+    """Fields of these lengths, None for any, and their offsets."""
+    try:
+        parts, offsets = wire.parse_fields(body, len(lengths))
+    except Malformed as error:
+        raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
+    if any(length not in (None, len(part)) for length, part in zip(lengths, parts, strict=True)):
+        raise HandshakeRefused(Drop.MALFORMED, "a field has another length")
+    return parts, offsets
+
+
+class Agreed(NamedTuple):
+    """What a client has when a handshake is done: who the server is, the session's secrets, and S_A | finished."""
 
     peer: PeerIdentity
     secrets: SessionSecrets
     server_cid: bytes
-    confirmation: bytes
-    """S_A, or zeros."""
     finished: bytes
 
 
@@ -107,37 +113,24 @@ class ClientHandshake:
         self.hello = Hello(mode, cid, randomness.bytes(wire.NONCE_SIZE))
         self._identity = identity
         self._ephemeral = randomness.private_key() if mode is Mode.EXCHANGE else None
-        self._transcript: sm3.SM3 | None = None
+        self._transcript = sm3.SM3()
 
     def proof(self, cookie: bytes) -> bytes:
         """The body of the PROOF."""
         identity = self._identity
         point = self._ephemeral.public_key.to_bytes() if self._ephemeral else b""
-        transcript = _transcript(self.hello, cookie)
+        self._transcript = transcript = _transcript(self.hello, cookie)
         unsigned = wire.fields([identity.signing_certificate.to_der(), identity.encryption_certificate.to_der(), point])
         transcript.update(unsigned)
         signature = wire.fields([ids.sign(identity.signing_key, "handshake", b"client" + _digest(transcript))])
         transcript.update(signature)
-        self._transcript = transcript
         return unsigned + signature
 
     def accept(self, body: bytes, trust: Trust, *, server_name: str | None, at: datetime) -> Agreed:
         """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
-        if self._transcript is None:
-            raise HandshakeRefused(Drop.UNEXPECTED, "an offer before the proof")
-        try:
-            parts, offsets = wire.parse_fields(body, 8)
-        except Malformed as error:
-            raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
-        nonce, server_cid, signing, encryption, material, signature, confirmation, mac = parts
-        exchange = self._ephemeral is not None
-        if (
-            len(nonce) != wire.NONCE_SIZE
-            or len(server_cid) != wire.CID_SIZE
-            or len(confirmation) != (CONFIRMATION_SIZE if exchange else 0)
-            or (exchange and len(material) != POINT_SIZE)
-        ):
-            raise HandshakeRefused(Drop.MALFORMED, "a field of the offer has another length")
+        material_size, confirmation_size = (POINT_SIZE, CONFIRMATION_SIZE) if self._ephemeral else (None, 0)
+        lengths = (wire.NONCE_SIZE, wire.CID_SIZE, None, None, material_size, None, confirmation_size, None)
+        (_, server_cid, signing, encryption, material, signature, confirmation, mac), offsets = _parse(body, lengths)
         try:
             peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
@@ -148,9 +141,9 @@ class ClientHandshake:
             ids.verify(peer.signing_certificate.public_key, "handshake", b"server" + _digest(transcript), signature)
             transcript.update(body[offsets[5] : offsets[7]])
             if self._ephemeral is not None:
-                exchange_a = _exchange(self._identity, peer, self._ephemeral, initiator=True)
-                shared, own = exchange_a.agree(material, SHARED_SIZE)
-                exchange_a.confirm(confirmation)
+                exchange = _exchange(self._identity, peer, self._ephemeral, initiator=True)
+                shared, own = exchange.agree(material, SHARED_SIZE)
+                exchange.confirm(confirmation)
             else:
                 shared, own = self._identity.encryption_key.decrypt(material), NO_CONFIRMATION
         except SMCryptoError as error:
@@ -161,7 +154,7 @@ class ClientHandshake:
         if not hmac.compare_digest(mac, finished(keys.server_finished, _digest(transcript))):
             raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold")
         transcript.update(body[offsets[7] :])
-        return Agreed(peer, keys, server_cid, own, finished(keys.client_finished, _digest(transcript)))
+        return Agreed(peer, keys, server_cid, own + finished(keys.client_finished, _digest(transcript)))
 
 
 class ServerHandshake:
@@ -170,19 +163,15 @@ class ServerHandshake:
     __slots__ = ("_exchange", "_finished", "offer", "peer", "secrets")
 
     def __init__(
-        self, hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, roles: tuple[Role, ...],
-        server_cid: bytes, randomness: Randomness, at: datetime,
+        self, hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, server_cid: bytes,
+        randomness: Randomness, at: datetime,
     ) -> None:  # fmt: skip
         """Raise HandshakeRefused unless certificates and signature hold. The cookie was checked before."""
         exchange = hello.mode is Mode.EXCHANGE
+        lengths = (None, None, POINT_SIZE if exchange else 0, None)
+        (signing, encryption, point, signature), offsets = _parse(body, lengths)
         try:
-            (signing, encryption, point, signature), offsets = wire.parse_fields(body, 4)
-        except Malformed as error:
-            raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
-        if len(point) != (POINT_SIZE if exchange else 0):
-            raise HandshakeRefused(Drop.MALFORMED, "a field of the proof has another length")
-        try:
-            self.peer = trust.check(signing, encryption, role=roles, at=at)
+            self.peer = trust.check(signing, encryption, role=Role.ROBOT, at=at)
         except ids.UntrustedCertificate as error:
             hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
             hint = hints.get(type(error), Reason.CERTIFICATE)
@@ -215,14 +204,16 @@ class ServerHandshake:
         self._finished = finished(self.secrets.client_finished, _digest(transcript))
         self.offer = unsigned + signed + last
 
-    def confirm(self, confirmation: bytes, mac: bytes) -> None:
-        """Return if the client's FINISHED holds, else HandshakeRefused."""
+    def confirm(self, finished: bytes) -> None:
+        """Return if the client's FINISHED, S_A | finished, holds, else HandshakeRefused."""
+        confirmation, mac = finished[:CONFIRMATION_SIZE], finished[CONFIRMATION_SIZE:]
+        holds = hmac.compare_digest(mac, self._finished)
         try:
             if self._exchange is not None:
                 self._exchange.confirm(confirmation)
-            elif confirmation != NO_CONFIRMATION:
-                raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold")
-        except SMCryptoError as error:
-            raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold") from error
-        if not hmac.compare_digest(mac, self._finished):
+            else:
+                holds = holds and confirmation == NO_CONFIRMATION
+        except SMCryptoError:
+            holds = False
+        if not holds:
             raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold")

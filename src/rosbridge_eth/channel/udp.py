@@ -9,6 +9,7 @@ after `patience`.
 from __future__ import annotations
 
 import array
+import contextlib
 import errno
 import select
 import socket
@@ -28,7 +29,6 @@ SEND_BUFFER = 1 << 20
 LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
 BATCH = 128  # datagrams taken before events are handed out and answers sent
 
-_SO_REUSEPORT = getattr(socket, "SO_REUSEPORT", None)
 _SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
 
 _NOT_THE_NETWORK = frozenset({errno.EBADF, errno.ENOTSOCK, errno.EFAULT, errno.ENOMEM})
@@ -44,9 +44,7 @@ def _open(family: int) -> socket.socket:
     return sock
 
 
-def _resolve(address: Address, *, passive: bool) -> tuple[int, Address]:
-    host, port = address
-    flags = socket.AI_PASSIVE if passive else 0
+def _resolve(host: str, port: int, flags: int = 0) -> tuple[int, Address]:
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags)
     except socket.gaierror as error:
@@ -57,7 +55,7 @@ def _resolve(address: Address, *, passive: bool) -> tuple[int, Address]:
 
 def client_socket(server: Address) -> tuple[socket.socket, Address]:
     """A socket to talk to `server` (host name or address, port), and its address for Client.connect."""
-    family, address = _resolve(server, passive=False)
+    family, address = _resolve(*server)
     return _open(family), address
 
 
@@ -68,22 +66,21 @@ def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
     the parent keeps them open, a worker that is started again finds its
     datagrams waiting. NetworkError if the port is taken or not allowed.
     """
-    family, place = _resolve(address, passive=True)
-    if workers > 1 and _SO_REUSEPORT is None:
+    family, place = _resolve(*address, socket.AI_PASSIVE)
+    reuse = getattr(socket, "SO_REUSEPORT", None)
+    if workers > 1 and reuse is None:
         raise NetworkError("this system cannot share a port between processes; run with one worker")
     sockets: list[socket.socket] = []
     try:
         # Bound without SO_REUSEPORT first: another server's port must be an error, not half of its datagrams.
         with _open(family) as probe:
             probe.bind(place)
-            if place[1] == 0:
-                place = (place[0], probe.getsockname()[1])
+            place = (place[0], probe.getsockname()[1])
         for _ in range(workers):
-            sock = _open(family)
-            sockets.append(sock)
-            if workers > 1 and _SO_REUSEPORT is not None:
-                sock.setsockopt(socket.SOL_SOCKET, _SO_REUSEPORT, 1)
-            sock.bind(place)
+            sockets.append(_open(family))
+            if workers > 1 and reuse is not None:
+                sockets[-1].setsockopt(socket.SOL_SOCKET, reuse, 1)
+            sockets[-1].bind(place)
     except OSError as error:
         for sock in sockets:
             sock.close()
@@ -91,18 +88,16 @@ def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
             f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; "
             "stop the program that has it, or choose another port"
         ) from error
-    if workers > 1:
+    if workers > 1 and sys.platform.startswith("linux"):
         _steer(sockets[0], workers)
     return sockets
 
 
-def _steer(sock: socket.socket, workers: int) -> bool:
+def _steer(sock: socket.socket, workers: int) -> None:
     """Send each datagram to the socket whose index is the first byte of its connection id, modulo `workers`.
 
-    Returns whether the kernel took the filter. Its program, over the UDP payload:
+    Where the kernel takes the filter; otherwise it chooses by address. Its program, over the UDP payload:
     """
-    if not sys.platform.startswith("linux"):
-        return False
     program = [
         (0x30, 0, 0, 0),  # A = byte 0: the kind
         (0x35, 0, 2, 0x40),  # kind >= DATA ? go on : skip 2
@@ -114,11 +109,8 @@ def _steer(sock: socket.socket, workers: int) -> bool:
     ]
     code = array.array("B", b"".join(struct.pack("=HBBI", *step) for step in program))
     argument = struct.pack("@HP", len(program), code.buffer_info()[0])
-    try:
+    with contextlib.suppress(OSError):  # an old kernel or a sandbox
         sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, argument)
-    except OSError:
-        return False  # an old kernel or a sandbox; the kernel then chooses by address
-    return True
 
 
 class UdpLoop:
@@ -127,16 +119,12 @@ class UdpLoop:
     `wake` may be called from any thread; all else from the loop's own.
     """
 
-    def __init__(
-        self, endpoint: Client | Server, sock: socket.socket, on_event: Callable[[Event], None], *,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+    def __init__(self, endpoint: Client | Server, sock: socket.socket, on_event: Callable[[Event], None]) -> None:
         self.endpoint = endpoint
         self.socket = sock
         self.lost_sends = 0
         """Datagrams that the system did not take."""
         self._on_event = on_event
-        self._clock = clock
         self._wake_receive, self._wake_send = socket.socketpair()
         self._wake_receive.setblocking(False)
         self._wake_send.setblocking(False)
@@ -146,21 +134,18 @@ class UdpLoop:
 
     def wake(self) -> None:
         """Make a waiting `step` return, from any thread or a signal handler; nothing happens once it is closed."""
-        try:
+        with contextlib.suppress(OSError):  # wake-ups enough are waiting, or another thread has just closed the loop
             self._wake_send.send(b"\0")
-        except OSError:
-            return  # wake-ups enough are waiting already, or another thread has just closed the loop
 
     def step(self, longest: float) -> None:
         """Send what may be sent; wait for something, at most `longest` seconds; take it and give out its events."""
-        endpoint, clock = self.endpoint, self._clock
-        now = clock()
+        endpoint, now = self.endpoint, time.monotonic()
         self._turn(now)
         when = endpoint.next_timer()
         wait = longest if when is None else min(longest, max(0.0, when - now))
         # Rounded up to a millisecond: to wake too early would be to wait in circles.
         ready = self._poll.poll(int(wait * 1000 + 0.999))
-        now = clock()
+        now = time.monotonic()
         for descriptor, _ in ready:
             if descriptor == self.socket.fileno():
                 self._receive(now)
@@ -173,7 +158,7 @@ class UdpLoop:
 
     def close(self) -> None:
         """Send what the endpoint still has to say, and close the socket and what belongs to the loop."""
-        self._flush(self._clock())
+        self._flush(time.monotonic())
         self.socket.close()
         self._wake_receive.close()
         self._wake_send.close()

@@ -1,21 +1,19 @@
-"""The parts under the channel, each against a plain model: windows, acknowledgements, frames, buckets, tables."""
+"""The parts under the channel, each against a plain model: windows, acknowledgements, frames, buckets."""
 
 from __future__ import annotations
 
 import random
 import tracemalloc
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.channel.steps import Steps, events
-from rosbridge_eth.channel import Message, states
+from rosbridge_eth.channel import Message
 from rosbridge_eth.channel.admission import Cookies, Sources, TokenBucket
 from rosbridge_eth.channel.delivery import GAIN, INITIAL_WINDOW, MINIMUM_WINDOW, QUEUE_SHARE, RoundTrip, Window
 from rosbridge_eth.channel.protection import Direction, ReplayWindow
-from rosbridge_eth.channel.states import CLIENT, SERVER, ClientInput, ClientState, ServerState, advance
 from rosbridge_eth.channel.wire import ACK_BITS, Ack, Hello, Malformed, Mode, fields, parse_fields
 from smcrypto import InvalidTag
 
@@ -48,27 +46,22 @@ def test_acknowledged_is_what_was_received_and_nothing_else(numbers):
     window = ReplayWindow()
     for number in numbers:
         window.mark(number)
-    frame = Ack(window.highest, 0.5, 3, 9, window.bits).to_bytes()
-    ack, end = Ack.parse(b"before" + frame, 6)
-    assert end == 6 + len(frame)
+    frame = Ack(window.highest, 3, window.bits).to_bytes()
+    ack, behind = Ack.parse(frame + b"behind")
+    assert behind == b"behind"
     told = {ack.largest - i for i in range(ack.bits.bit_length()) if ack.bits >> i & 1}
     assert told == {n for n in numbers if n > max(numbers) - ACK_BITS}
-    assert (ack.delay, ack.next_segment, ack.limit) == (0.5, 3, 9)
+    assert ack.next_segment == 3
 
 
 @given(st.binary(max_size=100))
 def test_any_bytes_are_an_acknowledgement_or_malformed(data):
     try:
-        ack, end = Ack.parse(b"\x02" + data, 0)
+        ack, behind = Ack.parse(b"\x02" + data)
     except Malformed:
         return
-    assert end <= len(data) + 1
+    assert data.endswith(behind)
     assert ack.bits & 1 and ack.bits.bit_length() <= min(ack.largest + 1, ACK_BITS)
-
-
-def test_a_delay_that_is_too_long_is_cut():
-    ack, _ = Ack.parse(Ack(1, 99.0, 0, 0, 1).to_bytes(), 0)
-    assert ack.delay == pytest.approx(6.5535)
 
 
 @given(st.lists(st.binary(max_size=60), max_size=9), st.binary(min_size=1, max_size=3))
@@ -155,7 +148,7 @@ def test_the_probe_timeout_doubles_to_a_limit():
 
 def test_a_cookie_is_for_one_address_hello_and_time():
     cookies = Cookies(bytes(32), 20.0)
-    place, hello = ("192.0.2.1", 5), Hello(Mode.EXCHANGE, b"clientid", bytes(32))
+    place, hello = ("192.0.2.1", 5), Hello(Mode.EXCHANGE, b"clientid", bytes(16))
     cookie = cookies.make(place, hello, 100.0)
     assert cookies.holds(cookie, place, hello, 119.9)
     for address, other, now in (
@@ -163,7 +156,7 @@ def test_a_cookie_is_for_one_address_hello_and_time():
         (("192.0.2.1", 6), hello, 100.0),
         (place, hello._replace(mode=Mode.TRANSPORT), 100.0),
         (place, hello._replace(client_cid=b"clientiD"), 100.0),
-        (place, hello._replace(nonce=b"\1" + bytes(31)), 100.0),
+        (place, hello._replace(nonce=b"\1" + bytes(15)), 100.0),
         (place, hello, 120.1),
         (place, hello, 99.0),
     ):
@@ -188,24 +181,6 @@ def test_a_bucket_never_holds_more_than_its_burst():
     assert bucket.available(1000.1) == pytest.approx(-1.0)
     bucket.charge(-100.0)
     assert bucket.level == 5.0
-
-
-# Tables
-
-
-def test_every_state_can_be_reached_and_left_and_an_absent_step_is_an_error():
-    for table, kind, first in ((CLIENT, ClientState, ClientState.IDLE), (SERVER, ServerState, ServerState.ASSEMBLING)):
-        reached = {first} | set(table.values())
-        assert reached == set(kind)
-        assert {state for state, _ in table} | {ServerState.GONE} >= set(kind)
-    with pytest.raises(RuntimeError, match="cannot happen"):
-        advance(CLIENT, ClientState.IDLE, ClientInput.ACCEPTED)
-
-
-def test_the_documentation_shows_the_tables_of_the_code():
-    text = (Path(__file__).parents[3] / "docs" / "channel.md").read_text()
-    assert states.as_markdown(CLIENT) in text
-    assert states.as_markdown(SERVER) in text
 
 
 def test_a_packet_opens_under_its_key_its_number_and_its_header_only():

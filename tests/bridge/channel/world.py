@@ -93,7 +93,7 @@ class ServerProgram:
         self.next: dict[bytes, int] = {}
         self.events: list[Event] = []
         self.broken: list[str] = []
-        self.most_held = 0
+        self.most_early = 0
         self.host: Host = network.attach(self._start(), SERVER_ADDRESS, self.on_event)
 
     @property
@@ -108,7 +108,7 @@ class ServerProgram:
         self.host.endpoint = self._start()
 
     def on_event(self, event: Event) -> None:
-        self.most_held = max(self.most_held, self.server.statistics().held_bytes)
+        self.most_early = max(self.most_early, self.server.statistics()["early"])
         if not isinstance(event, Message):
             self.events.append(event)
             return
