@@ -5,8 +5,8 @@ and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
 already exist; `Cipher` with `GCM` for what does not fit in memory. `cmac` and
 `cbc_mac` authenticate. `SM4` is the bare block.
 
-`ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC): "cryptography"
-where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
+`ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC, and `SM4GCM`):
+"cryptography" where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from hmac import compare_digest
 
 from smcrypto.errors import InvalidLength, InvalidTag
 from smcrypto.inputs import BytesLike, as_bytes, require_int
+from smcrypto.sm4 import serial
 from smcrypto.sm4.engine import Engine, xor_bytes
 from smcrypto.sm4.ghash import GHASH
 
@@ -51,10 +52,11 @@ class SM4GCM:
     b'message'
     """
 
-    __slots__ = ("_engine", "_ghash", "_t")
+    __slots__ = ("_engine", "_ghash", "_key", "_t")
 
     def __init__(self, key: BytesLike, tag_length: int = 16) -> None:
-        self._engine = Engine(as_bytes(key, "key"))
+        self._key = as_bytes(key, "key")
+        self._engine = Engine(self._key)
         self._t = _checked_tag_length(tag_length, (12, 13, 14, 15, 16))  # SP 800-38D, 5.2.1.2
         self._ghash: GHASH | None = None
 
@@ -66,6 +68,9 @@ class SM4GCM:
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
         _check_gcm_lengths(len(nonce), len(data), len(A))
+        if len(nonce) == 12 and (foreign := serial.gcm(len(data))) is not None:
+            sealed = foreign.seal(self._key, nonce, A, data)
+            return sealed if self._t == 16 else sealed[: self._t - 16]
         if self._ghash is None and len(nonce) == 12:  # the key's first message: E(K, 0^128) rides along
             J_0 = nonce + _ONE
             masks, C = self._engine.encrypt_and_ctr_xor(_ZERO + J_0, _inc32(J_0), data, 32)
@@ -78,8 +83,7 @@ class SM4GCM:
     def decrypt(self, nonce: BytesLike, data: BytesLike, associated_data: BytesLike = b"") -> bytes:
         """The plaintext of `data` = ciphertext ‖ tag; InvalidTag unless all three are as they were sealed.
 
-        The tag is compared, in constant time, before anything is decrypted. (For messages up to 4 KiB the key
-        stream is there by then, since E(K, J_0) costs nothing beside it; it meets the ciphertext afterwards.)
+        Nothing is returned before the tag was compared, in constant time.
         Data shorter than a tag is InvalidTag as well. Source: SP 800-38D, 7.2.
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
@@ -87,6 +91,11 @@ class SM4GCM:
         if len(data) < self._t:
             raise InvalidTag("the message is not authentic")
         C, T = data[: -self._t], data[-self._t :]
+        if len(nonce) == 12 and (foreign := serial.gcm(len(C))) is not None:
+            P = foreign.open(self._key, nonce, A, C, T)
+            if P is None:
+                raise InvalidTag("the message is not authentic")
+            return P
         J_0 = self._J_0(nonce)
         if len(C) > _ONE_PASS:
             self._check(self._engine.encrypt(J_0), A, C, T)

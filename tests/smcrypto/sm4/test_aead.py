@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smcrypto import InvalidKey, InvalidLength, InvalidTag
-from smcrypto.sm4 import SM4, SM4CCM, SM4GCM, aead
+from smcrypto.sm4 import SM4, SM4CCM, SM4GCM, aead, serial
 from smcrypto.sm4.engine import Engine
 from smcrypto.sm4.ghash import ghash_by_definition
 from vectors_json import load
@@ -242,7 +242,8 @@ def test_the_refusal_tells_nothing(cipher):
 
 @pytest.mark.parametrize("length", [300, 4096, 4097, 9000])
 def test_gcm_decrypts_nothing_before_the_tag_is_right(length, monkeypatch):
-    """The cipher is not shown the ciphertext, so no plaintext can exist."""
+    """In Python the cipher is not shown the ciphertext, so no plaintext can exist."""
+    monkeypatch.setattr(serial, "ENGINE", "python")
     gcm, text = SM4GCM(KEY), random.Random(length).randbytes(length)
     sealed = gcm.encrypt(NONCE, text)
     shown: list[bytes] = []
