@@ -13,7 +13,7 @@ import typer
 
 from rosbridge_eth.config import load_reader_config
 from rosbridge_eth.config.values import parse_time
-from rosbridge_eth.errors import ConfigError, VerificationError
+from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
@@ -52,7 +52,8 @@ def read(
 ) -> None:
     """Fetch a robot's log from the chain, prove it, open it, and give its records as JSON lines, bag, table or plot.
 
-    Exits with 9 where what the chain has is not what the robot wrote, or not all of it.
+    Exits with 9 where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record
+    of it is sealed for others.
     """
     from rosbridge_eth.identity import Trust, load_identity
     from rosbridge_eth.ledger import Ledger
@@ -104,6 +105,8 @@ def read(
         talk(f"nothing was read on {topic}; what was read is on: {', '.join(sorted(topics)) or 'no topic'}")
     if not verdict.sound:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
+    if not verdict.records and "no-grant" in verdict.counts:
+        raise IdentityError(f"nothing of {robot} is sealed for this reader; put {place.public} into its `readers/`")
     if plot is not None and trajectory is not None and not trajectory.draw(plot):
         raise ConfigError(f"{plot} is not drawn: none of the {chosen} chosen records holds a position")
 

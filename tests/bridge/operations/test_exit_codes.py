@@ -1,0 +1,117 @@
+"""What a script can act on: the table of docs/operations.md, each of its rows brought about."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bridge.chunks import chain as chunk_chain
+from bridge.operations.conftest import PASSWORD, Place
+from rosbridge_eth import chunk
+from rosbridge_eth.chunk import Log, robot_id
+from rosbridge_eth.cli import run
+from rosbridge_eth.identity import load_identity
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.ledger.nodes import EmbeddedChain
+from smcrypto import sm2
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "operations.md"
+TABLE = PAGE.read_text(encoding="utf-8").partition("### Exit codes")[2].partition("###")[0]
+ROWS = re.findall(r"^\| `([a-z]+)` \| ([^|]+) \| (\d+) \|", TABLE, re.MULTILINE)
+TK, STREAM = robot_id("robot_1"), b"s" * 16
+OPERATOR, READER = ("--passphrase-file", "pass"), ("--passphrase-file", "readers")
+REVOKE = ("revoke", "robot_1", "--compromised", *OPERATOR)
+CHECK = ("check", "robot_1", STREAM.hex(), "0")
+Given = Callable[[Place, Keyring], object]
+
+
+def as_it_is(place: Place, keys: Keyring) -> None:
+    """A home, a robot that wrote nothing yet, a node that answers."""
+
+
+def waiting(place: Place, keys: Keyring) -> None:
+    inbox = place.inbox()
+    inbox.append([(TK, one) for one in chunk_chain(1)], time.time())
+    inbox.close()
+
+
+def dead(place: Place, keys: Keyring) -> None:
+    waiting(place, keys)
+    inbox = place.inbox()
+    inbox.bury(TK, None, "given up")
+    inbox.close()
+
+
+def written(place: Place, keys: Keyring, reader: sm2.PublicKey | None = None) -> None:
+    """One chunk of the robot on the chain, for this reader or for one of whom nobody knows."""
+    who, _ = load_identity(place.robot.identity, PASSWORD)
+    [standing] = place.ledger.standings([TK])
+    account = next(keys.robot(number) for number in range(1, 9) if keys.robot(number).address == standing.account)
+    log = Log(place.operator.deployment().ledger, TK)
+    made = chunk.seal(
+        log, who.signing_key, [b'{"stream":{"source":"sim","software":"a test"}}'], stream=STREAM, number=0,
+        previous=bytes(32), sealed_ms=time.time_ns() // 10**6, goodbye=False, compress=True,
+        readers=[reader or sm2.PrivateKey.generate().public_key],
+    )  # fmt: skip
+    place.ledger.set_data(account, TK, [made.encoded])
+
+
+def forged(place: Place, keys: Keyring) -> None:
+    """A chunk in the robot's place, of which nobody can say who signed it."""
+    [standing] = place.ledger.standings([TK])
+    account = next(keys.robot(number) for number in range(1, 9) if keys.robot(number).address == standing.account)
+    place.ledger.set_data(account, TK, [next(iter(chunk_chain(1))).encoded])
+
+
+CASES: list[tuple[str, tuple[str, ...], Given]] = [
+    ("done", REVOKE, as_it_is),
+    ("the node is away", REVOKE, as_it_is),
+    ("it was revoked already", REVOKE, lambda place, keys: run(REVOKE)),
+    ("the name is used", ("register", "robot_1", "robot/request.json", *OPERATOR), as_it_is),
+    ("the chunk waits", CHECK, waiting),
+    ("the chunk is known nowhere", CHECK, dead),
+    ("no robot of that name was ever enrolled", ("check", "robot_9", STREAM.hex(), "0"), as_it_is),
+    ("what is there is sound", ("read", "robot_1", *READER), as_it_is),
+    ("what is there is not what", ("read", "robot_1", *READER), forged),
+    ("it is sound, and every record is sealed for others", ("read", "robot_1", *READER), written),
+    ("no robot of that name is in the contract", ("read", "robot_9", *READER), as_it_is),
+    ("shown", ("status",), as_it_is),
+    ("the node is on another chain", ("status",), as_it_is),
+    ("something is broken", ("doctor",), lambda place, keys: place.path.joinpath("operator").chmod(0o777)),
+    ("a contract is deployed already", ("deploy", *OPERATOR), as_it_is),
+    ("the folder is a home already", ("backup", "robot"), as_it_is),
+]
+
+
+def test_every_row_is_brought_about_here():
+    assert len(ROWS) == len(CASES)
+    assert [command for command, _, _ in ROWS] == [arguments[0] for _, arguments, _ in CASES]
+    assert all(told.startswith(case) for (_, told, _), (case, _, _) in zip(ROWS, CASES, strict=True))
+
+
+@pytest.mark.parametrize("row, case", [*zip(ROWS, CASES, strict=True)], ids=[f"{row[0]} {row[2]}" for row in ROWS])
+def test_the_exit_code_is_the_one_of_the_table(
+    row: tuple[str, str, str], case: tuple[str, tuple[str, ...], Given], place: Place, keys: Keyring,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    (_, _, code), (what, arguments, given) = row, case
+    connect = Ledger.connect
+    node = place.chain
+    if "another chain" in what:
+        node = EmbeddedChain({keys.operator.address: 10**20})
+    if "away" not in what:  # else the home's URL is tried, where nobody is
+        monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(node, at, **more))
+    given(place, keys)
+    assert run(arguments) == int(code), capsys.readouterr().err
+
+
+def test_one_record_that_opens_is_enough(place: Place, keys: Keyring, monkeypatch: pytest.MonkeyPatch):
+    connect = Ledger.connect
+    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
+    owner, _ = load_identity(place.path / "reader", b"the reader's own words")
+    written(place, keys, owner.encryption_key.public_key)
+    assert run(["read", "robot_1", *READER]) == 0
