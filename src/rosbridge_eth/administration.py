@@ -26,7 +26,7 @@ from rosbridge_eth.chunk import MAX_READERS, robot_id
 from rosbridge_eth.config import Address, ServerConfig, load_server_config, parse_config
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
-from rosbridge_eth.files import read_private, write_atomically
+from rosbridge_eth.files import read_file, write_atomically
 from rosbridge_eth.home import Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, require_empty
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
@@ -131,7 +131,7 @@ def _make_ca(folder: Path, passphrase: bytes, now: datetime) -> CertificateAutho
 
 def server_trust(home: OperatorHome, registry: Registry) -> ids.Trust:
     """Whom the server believes: certificates of the CA that are in force in the registry."""
-    return ids.Trust(ids.load_certificates(home.ca_certificate), allowed=registry.allows)
+    return ids.Trust(ids.read_certificates(read_file(home.ca_certificate)), allowed=registry.allows)
 
 
 def load_server_identity(home: OperatorHome, passphrase: bytes) -> ids.Identity:
@@ -184,7 +184,7 @@ def change_passphrase(path: Path, old: bytes, new: bytes) -> list[Path]:
     if (accounts := OperatorHome(path).accounts).exists():
         files.append(accounts)
     for file in files:
-        content = read_private(file)
+        content = read_file(file, private=True)
         for passphrase in (old, new):  # what an attempt that was cut short wrote is under the new one
             with suppress(InvalidKey, IdentityError):
                 if file == accounts:

@@ -105,8 +105,7 @@ def ask_to_join(home: RobotHome, name: str, password: bytes) -> Request:
     require_empty(home.path)
     _make_folders(home)
     keys = [sm2.PrivateKey.generate() for _ in KEY_FILES]
-    for file, key in zip(KEY_FILES, keys, strict=True):
-        write_atomically(home.identity / file, key.to_pem(password), mode=0o600)
+    ids.write_files(home.identity, {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)})
     request = Request.make(name, *keys)
     write_atomically(home.request, request.encode())
     make_home(home.path, HomeKind.ROBOT, name=name)
@@ -135,8 +134,7 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     if home.bridge_file.exists() and home.bridge().ledger != bundle.end.ledger:
         raise ConfigError(f"{home.path} writes to another ledger already; choose another folder")
     _make_folders(home)
-    for name, content in files.items():
-        write_atomically(home.identity / name, content, mode=0o600 if name in KEY_FILES else 0o644)
+    ids.write_files(home.identity, files)
     for name, pem in bundle.readers.items():
         write_atomically(home.readers / f"{name}.pem", pem.encode())
     home.raise_clock_floor(peer.not_before.timestamp())
@@ -159,8 +157,7 @@ def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:
 
 def _make_folders(home: RobotHome) -> None:
     """The folders of a robot's home, and the configuration that it begins with."""
-    for folder in (home.path, home.identity, home.readers):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    home.readers.mkdir(mode=0o700, parents=True, exist_ok=True)
     home.path.chmod(0o700)
     if not home.config.exists():
         write_atomically(home.config, FIRST_CONFIG.encode())

@@ -31,50 +31,37 @@ class BridgeError(Exception):
 
     exit_code: ClassVar[ExitCode] = ExitCode.FAILED
 
+    def __init_subclass__(cls, exit_code: ExitCode | None = None) -> None:
+        cls.exit_code = exit_code or cls.exit_code
 
-class ConfigError(BridgeError):
+
+class ConfigError(BridgeError, exit_code=ExitCode.CONFIG):
     """The configuration cannot be used; the text names file, key and the allowed values."""
 
-    exit_code = ExitCode.CONFIG
 
-
-class IdentityError(BridgeError):
+class IdentityError(BridgeError, exit_code=ExitCode.IDENTITY):
     """A key, certificate, password or bundle is missing, unreadable, refused or not protected."""
 
-    exit_code = ExitCode.IDENTITY
 
-
-class StoreError(BridgeError):
+class StoreError(BridgeError, exit_code=ExitCode.STORE):
     """The spool, inbox or journal cannot be opened or written, or belongs to another chain."""
 
-    exit_code = ExitCode.STORE
 
-
-class NetworkError(BridgeError):
+class NetworkError(BridgeError, exit_code=ExitCode.NETWORK):
     """A socket cannot be opened, or the peer does not answer or is not who it should be."""
 
-    exit_code = ExitCode.NETWORK
 
-
-class ChainError(BridgeError):
+class ChainError(BridgeError, exit_code=ExitCode.CHAIN):
     """The node does not answer, refuses, or is not the chain that was expected."""
 
-    exit_code = ExitCode.CHAIN
 
-
-class SourceError(BridgeError):
+class SourceError(BridgeError, exit_code=ExitCode.SOURCE):
     """A bag, master or topic cannot be read."""
 
-    exit_code = ExitCode.SOURCE
 
-
-class VerificationError(BridgeError):
+class VerificationError(BridgeError, exit_code=ExitCode.VERIFICATION):
     """What was read back is not what was written, or cannot be proven to be."""
 
-    exit_code = ExitCode.VERIFICATION
 
-
-class ProcessError(BridgeError):
+class ProcessError(BridgeError, exit_code=ExitCode.PROCESS):
     """A process of the server ends again and again as soon as it is started."""
-
-    exit_code = ExitCode.PROCESS

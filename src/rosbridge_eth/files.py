@@ -53,13 +53,13 @@ def write_atomically(path: Path, content: bytes, *, mode: int = 0o644, new: bool
         Path(temporary).unlink(missing_ok=True)
 
 
-def read_private(path: Path) -> bytes:
-    """The content of a file that holds a secret; IdentityError where others may read it, or it cannot be read."""
+def read_file(path: Path, *, private: bool = False) -> bytes:
+    """The content of a file; IdentityError where it cannot be read, or holds a secret that others may read."""
     try:
         mode, content = stat.S_IMODE(path.stat().st_mode), path.read_bytes()
     except OSError as error:
         raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
-    if mode & 0o077:
+    if private and mode & 0o077:
         raise IdentityError(
             f"{path} is open to others (mode {mode:04o}); run `chmod 600 {path}`, and if it may have been read,"
             " make its keys anew"

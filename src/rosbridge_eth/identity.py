@@ -22,7 +22,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from rosbridge_eth.errors import IdentityError, VerificationError
-from rosbridge_eth.files import read_private, write_atomically
+from rosbridge_eth.files import read_file, write_atomically
 from smcrypto import CertificateError, InvalidKey, InvalidSignature, SMCryptoError, sm2, x509
 
 SIGNATURE_SIZE = 64
@@ -30,7 +30,6 @@ SIGNATURE_SIZE = 64
 
 URI_PREFIX = "URI:urn:rosbridge-eth:"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]{0,62}\Z")
-_PURPOSE = re.compile(r"[a-z][a-z-]*\Z")
 
 _CA_LIFE, _LIFE = timedelta(days=3650), timedelta(days=825)
 _BACKDATED = timedelta(days=1)
@@ -59,14 +58,6 @@ class UntrustedCertificate(IdentityError):
 
 class ExpiredCertificate(UntrustedCertificate):
     """A certificate is not valid yet, or not any more."""
-
-
-class WrongRole(UntrustedCertificate):
-    """The certificate is good, but its holder has another role than the one expected here."""
-
-
-class WrongName(UntrustedCertificate):
-    """The certificate is good, but it is somebody else's."""
 
 
 class NotAllowed(UntrustedCertificate):
@@ -144,8 +135,7 @@ class CertificateAuthority:
 
 
 def _message(purpose: str, body: bytes) -> bytes:
-    if not _PURPOSE.match(purpose):
-        raise ValueError(f"a purpose is lower-case letters and hyphens, not {purpose!r}")
+    """purpose: lower-case letters and hyphens; it ends at the zero byte."""
     return b"rosbridge-eth/2 " + purpose.encode("ascii") + b"\0" + body
 
 
@@ -204,7 +194,7 @@ class Trust:
         signature verifications.
         """
         try:
-            peer = _pair(x509.Certificate.from_der(signing_der), x509.Certificate.from_der(encryption_der))
+            peer = _pair(*map(x509.Certificate.from_der, (signing_der, encryption_der)))
         except (CertificateError, InvalidKey) as error:
             raise UntrustedCertificate(f"a certificate cannot be read: {error}") from error
         if not peer.not_before <= at <= peer.not_after:
@@ -215,20 +205,18 @@ class Trust:
             (peer.signing_certificate, "digitalSignature", ENCRYPTION_USAGE),
             (peer.encryption_certificate, "keyAgreement", SIGNING_USAGE),
         ):
+            purpose = _extended_key_usage(peer.role)
             try:
-                x509.verify_chain(
-                    certificate, roots=self.roots, at=at, key_usage=(use,),
-                    extended_key_usage=_extended_key_usage(peer.role),
-                )  # fmt: skip
+                x509.verify_chain(certificate, roots=self.roots, at=at, key_usage=(use,), extended_key_usage=purpose)
             except CertificateError as error:
                 raise UntrustedCertificate(f"the certificate of {peer} is not to be trusted: {error}") from error
             if certificate.key_usage is None or set(other) & set(certificate.key_usage):
                 raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
         roles = (role,) if isinstance(role, Role) else tuple(role)
         if peer.role not in roles:
-            raise WrongRole(f"{peer} was met where a {' or '.join(roles)} is expected")
+            raise UntrustedCertificate(f"{peer} was met where a {' or '.join(roles)} is expected")
         if name is not None and peer.name != name:
-            raise WrongName(f"{peer} was met where {name} is expected")
+            raise UntrustedCertificate(f"{peer} was met where {name} is expected")
         if self.allowed is not None and not self.allowed(peer):
             raise NotAllowed(f"{peer} is not on the allow list")
         return peer
@@ -251,29 +239,25 @@ def load_ca(folder: Path, password: bytes, at: datetime) -> CertificateAuthority
 
     IdentityError where the key does not open, is another's, or the certificate is no CA's or not valid at `at`.
     """
-    certificate = load_certificates(folder / "ca.crt.pem")[0]
+    key_file, file = folder / "ca.key.pem", folder / "ca.crt.pem"
+    certificate = read_certificates(read_file(file))[0]
     try:
-        key = sm2.PrivateKey.from_pem(read_private(folder / "ca.key.pem"), password=password)
+        key = sm2.PrivateKey.from_pem(read_file(key_file, private=True), password=password)
     except InvalidKey as error:
-        raise IdentityError(f"{folder / 'ca.key.pem'} does not open under this passphrase") from error
-    usage, life = certificate.key_usage, (certificate.not_before, certificate.not_after)
+        raise IdentityError(f"{key_file} does not open under this passphrase") from error
+    usage, (begin, end) = certificate.key_usage, (certificate.not_before, certificate.not_after)
     if key.public_key != certificate.public_key:
-        raise IdentityError(f"{folder / 'ca.key.pem'} is not the key of {folder / 'ca.crt.pem'}")
+        raise IdentityError(f"{key_file} is not the key of {file}")
     if not certificate.is_ca or (usage is not None and "keyCertSign" not in usage):
-        raise IdentityError(f"{folder / 'ca.crt.pem'} is not a CA's certificate: it may not issue others")
-    if not life[0] <= at <= life[1]:
-        raise IdentityError(f"{folder / 'ca.crt.pem'} is valid from {life[0]} to {life[1]}, not at {at}")
+        raise IdentityError(f"{file} is not a CA's certificate: it may not issue others")
+    if not begin <= at <= end:
+        raise IdentityError(f"{file} is valid from {begin} to {end}, not at {at}")
     return CertificateAuthority(key, certificate)
 
 
-def requests(
-    name: str, *keys: sm2.PrivateKey
-) -> tuple[x509.CertificateSigningRequest, x509.CertificateSigningRequest]:
+def requests(name: str, *keys: sm2.PrivateKey) -> list[x509.CertificateSigningRequest]:
     """The two certificate requests of a signing and an encryption key that never leave their machine."""
-    signing, encryption = (
-        x509.CertificateSigningRequest.create(key, subject={"CN": check_name(name)}) for key in keys
-    )
-    return signing, encryption
+    return [x509.CertificateSigningRequest.create(key, subject={"CN": check_name(name)}) for key in keys]
 
 
 def enrol_requests(
@@ -338,11 +322,6 @@ def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
         raise IdentityError(f"a certificate cannot be read: {error}") from error
 
 
-def load_certificates(file: Path) -> tuple[x509.Certificate, ...]:
-    """Those of a file; IdentityError also where it cannot be read."""
-    return read_certificates(_read(file))
-
-
 def public_identity(pem: bytes) -> PeerIdentity:
     """Whom a PEM file of two certificates, signing first, names; nothing of it is checked (`Trust.check`)."""
     found = read_certificates(pem)
@@ -368,39 +347,34 @@ def identity_from_files(
     """The reverse of `identity_files`: the identity and the roots. Keys must belong to their certificates."""
     if missing := [name for name in _FILES if name not in files]:
         raise IdentityError(f"the identity is not complete: {', '.join(missing)} missing")
-    keys: list[sm2.PrivateKey] = []
-    certificates: list[x509.Certificate] = []
-    for name in ("sign", "enc"):
+    peer = public_identity(files["sign.crt.pem"] + files["enc.crt.pem"])
+    keys = []
+    for name, certificate in zip(KEY_FILES, (peer.signing_certificate, peer.encryption_certificate), strict=True):
         try:
-            keys.append(sm2.PrivateKey.from_pem(files[f"{name}.key.pem"], password))
+            keys.append(sm2.PrivateKey.from_pem(files[name], password))
         except SMCryptoError as error:
-            raise IdentityError(f"{name}.key.pem cannot be opened: wrong password, or not a key file") from error
-        certificates.append(read_certificates(files[f"{name}.crt.pem"])[0])
-        if keys[-1].public_key != certificates[-1].public_key:
-            raise IdentityError(f"{name}.key.pem is not the key of {name}.crt.pem")
-    peer = _pair(*certificates)
+            raise IdentityError(f"{name} cannot be opened: wrong password, or not a key file") from error
+        if keys[-1].public_key != certificate.public_key:
+            raise IdentityError(f"{name} is not the key of {name.replace('key', 'crt')}")
     identity = Identity(peer.role, peer.name, peer.signing_certificate, peer.encryption_certificate, *keys)
     return identity, read_certificates(files["ca.crt.pem"])
 
 
-def save_identity(folder: Path, identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None) -> None:
-    """Write `identity_files` into `folder` (made 0700 if absent), key files 0600; nothing is overwritten."""
+def write_files(folder: Path, files: Mapping[str, bytes], *, new: bool = False) -> None:
+    """Write an identity's files into `folder` (made 0700 if absent), keys 0600. new: IdentityError if one exists."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    for name, content in identity_files(identity, roots, password).items():
+    for name, content in files.items():
         try:
-            write_atomically(folder / name, content, mode=0o600 if name in KEY_FILES else 0o644, new=True)
+            write_atomically(folder / name, content, mode=0o600 if name in KEY_FILES else 0o644, new=new)
         except FileExistsError:
             raise IdentityError(f"{folder / name} exists and is not overwritten") from None
 
 
+def save_identity(folder: Path, identity: Identity, roots: Sequence[x509.Certificate], password: bytes | None) -> None:
+    """Write `identity_files` into `folder`; nothing is overwritten."""
+    write_files(folder, identity_files(identity, roots, password), new=True)
+
+
 def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """Read what `save_identity` wrote; a key file that others may read is refused."""
-    read = {name: read_private if name in KEY_FILES else _read for name in _FILES}
-    return identity_from_files({name: read[name](folder / name) for name in _FILES}, password)
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise IdentityError(f"{path} cannot be read: {error.strerror}") from error
+    return identity_from_files({name: read_file(folder / name, private=name in KEY_FILES) for name in _FILES}, password)

@@ -12,7 +12,7 @@ import sqlite3
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from eth_utils.crypto import keccak
 
@@ -41,7 +41,7 @@ CREATE UNIQUE INDEX IF NOT EXISTS in_force ON enrolment (role, name) WHERE revok
 
 @dataclass(frozen=True, slots=True)
 class Enrolment:
-    """One identity the operator certified: certificates in PEM, signing first; account for robots only."""
+    """One identity the operator certified: a row as above, `account` for robots only."""
 
     number: int
     role: str
@@ -50,8 +50,8 @@ class Enrolment:
     certificates: bytes
     hash: bytes
     account: str | None
-    enrolled_at: datetime
-    revoked_at: datetime | None
+    enrolled_at: str
+    revoked_at: str | None
 
     @property
     def tk(self) -> bytes:
@@ -157,14 +157,14 @@ class Registry:
         rows = self._db.execute(
             "SELECT * FROM enrolment WHERE ?1 IS NULL OR role = ?1 ORDER BY number", (role and str(role),)
         )
-        return [_enrolment(*row) for row in rows]
+        return [Enrolment(*row) for row in rows]
 
     def find(self, role: str, name: str) -> Enrolment | None:
         """The enrolment in force under this name."""
         row = self._db.execute(
             "SELECT * FROM enrolment WHERE role = ? AND name = ? AND revoked_at IS NULL", (str(role), name)
         ).fetchone()
-        return _enrolment(*row) if row else None
+        return Enrolment(*row) if row else None
 
     def allows(self, peer: PeerIdentity) -> bool:
         """Is this very certificate the one in force for the name? StoreError as `revision`: asked of a registry that
@@ -184,8 +184,3 @@ class Registry:
     def names(self) -> dict[bytes, str]:
         """Every robot there ever was: Tk to its name."""
         return {tk: robot.name for tk, robot in self.robots().items()}
-
-
-def _enrolment(*row: Any) -> Enrolment:
-    values = [*row[:-2], *(text and datetime.fromisoformat(text) for text in row[-2:])]
-    return Enrolment(*values)

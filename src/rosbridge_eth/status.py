@@ -167,8 +167,8 @@ def _operator(place: OperatorHome) -> Report:
         enrolled, robots = registry.all(), registry.robots()
     report: Report = {
         "names": [
-            {"role": each.role, "name": each.name, "enrolled": each.enrolled_at.isoformat(),
-             "revoked": each.revoked_at and each.revoked_at.isoformat(), "account": each.account}
+            {"role": each.role, "name": each.name, "enrolled": each.enrolled_at,
+             "revoked": each.revoked_at, "account": each.account}
             for each in enrolled
         ],
         "robots": {each.name: {"account": each.account, "in_force": each.revoked_at is None}

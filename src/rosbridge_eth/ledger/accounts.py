@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from rosbridge_eth.errors import IdentityError
-from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_private, seal_box, write_atomically
+from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_file, seal_box, write_atomically
 from rosbridge_eth.ledger.transport import limit_recursion
 
 if TYPE_CHECKING:
@@ -142,4 +142,4 @@ class Keyring:
     @staticmethod
     def load(path: Path, passphrase: bytes) -> Keyring:
         """Read what `save` wrote; IdentityError also where others may read the file."""
-        return Keyring.open(read_private(path), passphrase)
+        return Keyring.open(read_file(path, private=True), passphrase)

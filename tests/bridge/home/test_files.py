@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosbridge_eth.errors import IdentityError
-from rosbridge_eth.files import box_head, open_box, read_private, seal_box, write_atomically
+from rosbridge_eth.files import box_head, open_box, read_file, seal_box, write_atomically
 
 HEAD = {"format": "rosbridge-eth bundle 2", "name": "robot_1"}
 FORMAT = HEAD["format"]
@@ -48,15 +48,15 @@ def test_the_mode_holds_from_the_first_byte_and_a_new_file_overwrites_nothing(tm
 def test_a_file_with_a_secret_must_be_private(tmp_path: Path) -> None:
     key = tmp_path / "sign.key.pem"
     with pytest.raises(IdentityError, match="cannot be read: No such file"):
-        read_private(key)
+        read_file(key, private=True)
     key.write_text("secret")
     for mode in (0o644, 0o640, 0o604, 0o620, 0o601):
         os.chmod(key, mode)
         with pytest.raises(IdentityError, match=rf"open to others \(mode {mode:04o}\); run `chmod 600"):
-            read_private(key)
+            read_file(key, private=True)
     for mode in (0o600, 0o400):
         os.chmod(key, mode)
-        assert read_private(key) == b"secret"
+        assert read_file(key, private=True) == b"secret"
 
 
 def test_a_box_opens_under_its_password_and_shows_its_head_alone() -> None:

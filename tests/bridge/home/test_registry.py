@@ -50,7 +50,7 @@ def test_a_used_name_needs_replace_which_revokes_the_old(registry: Registry) -> 
     new = enrol(registry, "robot_1", replace=True)
     assert not registry.allows(old)
     assert registry.allows(new)
-    assert [found.revoked_at for found in registry.all("robot")] == [NOON, None]
+    assert [found.revoked_at for found in registry.all("robot")] == [NOON.isoformat(), None]
 
 
 def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
@@ -61,7 +61,7 @@ def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
     assert registry.names() == {robot_id("robot_1"): "robot_1", robot_id("robot_2"): "robot_2"}
     robots = registry.robots()
     assert {tk: (robot.number, robot.revoked_at) for tk, robot in robots.items()} == {
-        robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON),
+        robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON.isoformat()),
     }
     assert robots[robot_id("robot_1")].hash == keccak(newest.certificates)
     assert registry.find("robot", "robot_2") is None
