@@ -176,8 +176,7 @@ def stage_costs(
         assert record is not None
         with watch("robot: seal"):
             now = time.monotonic()
-            line = partial(definition_line, raw.decoder)
-            writer.add(record.line, now, type_name=record.type_name, definition_line=line)
+            writer.add(record.line, now, (record.type_name, definition_line(raw.decoder)))
             closed = writer.closed(now + 2.0, time.time_ns() // 10**6) if number % per_chunk == 0 else []
         chunks += closed
         with watch("robot: spool"):

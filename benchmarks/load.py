@@ -401,7 +401,7 @@ def seal_all(writer: LogWriter, messages: int, per_chunk: int) -> Iterator[Chunk
     lines, type_name, definition = captured(messages)
     now = 0.0
     for number, line in enumerate(lines, 1):
-        writer.add(line, now, type_name=type_name, definition_line=lambda: definition)
+        writer.add(line, now, (type_name, definition))
         if number % per_chunk == 0 and number < messages:
             now += 10.0  # `period` is over
             yield from writer.closed(now, time.time_ns() // 10**6)

@@ -20,6 +20,7 @@ import secrets
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -50,8 +51,7 @@ MAX_TIME_MS: Final = 253_402_300_800_000
 
 STREAM_SIZE: Final = 16
 KEY_SIZE: Final = 16
-_SALT, _TAG, _GCM_TAG, _BLOCK = 16, 8, 16, 64
-_HASH = 32
+_SALT, _TAG, _GCM_TAG, _HASH, _BLOCK = 16, 8, 16, 32, 64
 _WRAPPED = 1 + 64 + _HASH + KEY_SIZE  # C1 | C3 | C2, GB/T 32918.4
 _GRANT = _TAG + _WRAPPED
 _FIXED = struct.Struct(">BB16sQ32sQI32sI32sB")
@@ -128,10 +128,7 @@ class Header:
     body_digest: bytes
     grants: tuple[tuple[bytes, bytes], ...] = field(repr=False)
     encoded: bytes = field(repr=False)
-    digest: bytes = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "digest", sm3.digest(self.encoded))
+    digest: bytes
 
     @property
     def goodbye(self) -> bool:
@@ -146,9 +143,7 @@ class Header:
         """The header whose encoding is exactly `data`; Malformed if there is none."""
         if not _FIXED.size <= len(data) <= MAX_HEADER:
             raise Malformed(f"no header of a chunk has {len(data)} bytes")
-        version, flags, stream, number, previous, sealed_ms, records, root, length, digest, count = (
-            _FIXED.unpack_from(data)
-        )
+        version, flags, stream, number, previous, sealed, records, root, size, digest, count = _FIXED.unpack_from(data)
         if version != VERSION or flags & ~GOODBYE:
             raise Malformed(f"a chunk of version {version} with flags {flags} is not known here")
         if len(data) != _FIXED.size + count * _GRANT:
@@ -156,24 +151,19 @@ class Header:
         grants = tuple(
             (data[at : at + _TAG], data[at + _TAG : at + _GRANT]) for at in range(_FIXED.size, len(data), _GRANT)
         )
-        header = Header(flags, stream, number, previous, sealed_ms, records, root, length, digest, grants, data)
-        header._check()
+        name = sm3.digest(data)
+        header = Header(flags, stream, number, previous, sealed, records, root, size, digest, grants, data, name)
+        if sealed >= MAX_TIME_MS:
+            raise Malformed(f"{header} was sealed after the year 9999")
+        if records == 0:
+            if size or grants or root != _EMPTY or digest != _EMPTY:
+                raise Malformed(f"{header} has no records, and a body, root or grants nevertheless")
+        elif (
+            records > MAX_RECORDS or not 1 <= count <= MAX_READERS
+            or not _GCM_TAG < size <= MAX_BODY or size % _BLOCK != _GCM_TAG
+        ):  # fmt: skip
+            raise Malformed(f"{header} cannot have {records} records in {size} bytes for {count} readers")
         return header
-
-    def _check(self) -> None:
-        if self.sealed_ms >= MAX_TIME_MS:
-            raise Malformed(f"{self} was sealed after the year 9999")
-        if self.records == 0:
-            if self.body_length or self.grants or self.root != _EMPTY or self.body_digest != _EMPTY:
-                raise Malformed(f"{self} has no records, and a body, root or grants nevertheless")
-        elif not (self.records <= MAX_RECORDS and 1 <= len(self.grants) <= MAX_READERS and _is_body(self.body_length)):
-            raise Malformed(
-                f"{self} cannot have {self.records} records in {self.body_length} bytes for {len(self.grants)} readers"
-            )
-
-
-def _is_body(length: int) -> bool:
-    return _GCM_TAG < length <= MAX_BODY and length % _BLOCK == _GCM_TAG
 
 
 #: Digest of the empty body, and root of the tree without leaves (RFC 9162, 2.1.1).
@@ -272,10 +262,8 @@ def _pack(lines: Sequence[bytes], compress: bool, level: int) -> bytes:
 def _compressed(content: bytes, level: int) -> bytes:
     # Messages are long repetitions with digits between them. Matches of three digits, or far away, cost more
     # bits than the digits themselves: 68 bytes a record instead of 82 (see benchmarks/bench_log.py).
-    parameter = zstd.CompressionParameter
-    return zstd.compress(
-        content, options={parameter.compression_level: level, parameter.min_match: 6, parameter.hash_log: 14}
-    )
+    of = zstd.CompressionParameter
+    return zstd.compress(content, options={of.compression_level: level, of.min_match: 6, of.hash_log: 14})
 
 
 def _stored(content: bytes) -> bytes:
@@ -313,14 +301,12 @@ def content_key(header: Header, reader: sm2.PrivateKey) -> bytes:
     """The 16-byte key of the chunk's body; NoGrant if it was not wrapped to `reader`, Unopenable if wrongly."""
     tag = _tag(header.stream + header.number.to_bytes(8, "big"), reader.public_key)
     wrapped = [grant for name, grant in header.grants if name == tag]
-    if not wrapped:
-        raise NoGrant(f"{header} was not granted to this reader")
     for grant in wrapped:
-        try:
+        with suppress(InvalidCiphertext):
             return reader.decrypt(grant, encoding="c1c3c2")
-        except InvalidCiphertext:
-            continue
-    raise Unopenable(f"the key that {header} grants to this reader does not decrypt")
+    if wrapped:
+        raise Unopenable(f"the key that {header} grants to this reader does not decrypt")
+    raise NoGrant(f"{header} was not granted to this reader")
 
 
 def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:

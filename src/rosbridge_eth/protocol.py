@@ -14,8 +14,7 @@ stream, and the robot goes on from there. The robot is never named: it is who th
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from rosbridge_eth.chunk import MAX_CHUNK
 
@@ -30,8 +29,7 @@ class ProtocolError(Exception):
     """The peer sent what is not a message; the session is of no use any more."""
 
 
-@dataclass(frozen=True, slots=True)
-class Where:
+class Where(NamedTuple):
     """Up: I would send this chunk of this stream next; the answer is Stored, or Hold."""
 
     stream: bytes
@@ -39,15 +37,13 @@ class Where:
     digest: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(NamedTuple):
     """Up: one encoded chunk."""
 
-    chunk: bytes = field(repr=False)
+    chunk: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
+class Stored(NamedTuple):
     """Down: the newest chunk of that stream that is committed; None and zeros if there is none."""
 
     stream: bytes
@@ -55,23 +51,20 @@ class Stored:
     digest: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Confirmed:
+class Confirmed(NamedTuple):
     """Down: everything of the log up to this chunk is confirmed on the chain."""
 
     stream: bytes
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class Hold:
+class Hold(NamedTuple):
     """Down: send nothing until the next Stored."""
 
     why: str
 
 
-@dataclass(frozen=True, slots=True)
-class Refused:
+class Refused(NamedTuple):
     """Down: this chunk will never be taken."""
 
     stream: bytes
@@ -86,14 +79,14 @@ Down: TypeAlias = Stored | Confirmed | Hold | Refused
 def encode(message: Up | Down) -> bytes:
     """The message as bytes. A reason is cut to MAX_WHY bytes, and what does not print in it becomes a space."""
     match message:
-        case Where(stream, number, digest):
-            return _WHERE_FORM.pack(_WHERE, stream, number, digest)
+        case Where():
+            return _WHERE_FORM.pack(_WHERE, *message)
         case Offer(chunk):
             return bytes((_OFFER,)) + chunk
         case Stored(stream, number, digest):
             return _STORED_FORM.pack(_STORED, stream, number is not None, number or 0, digest)
-        case Confirmed(stream, number):
-            return _PLACE_FORM.pack(_CONFIRMED, stream, number)
+        case Confirmed():
+            return _PLACE_FORM.pack(_CONFIRMED, *message)
         case Hold(why):
             return bytes((_HOLD,)) + _reason(why)
         case Refused(stream, number, why):

@@ -22,7 +22,7 @@ from pathlib import Path
 from socket import socket as Socket
 from typing import TypeVar
 
-from rosbridge_eth.capture import Capture, Captured, Decoder, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.capture import Capture, Captured, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
@@ -90,7 +90,6 @@ class Robot:
         self._stop = threading.Event()
         self._source_ended = threading.Event()
         self._source_error: BaseException | None = None
-        self._decoders: dict[str, tuple[Decoder | None, int]] = {}  # by type: the one in force, how often it changed
         self._unspooled: deque[Chunk] = deque()
         self._spool_at = float("-inf")
         self._losses_at = float("-inf")
@@ -188,8 +187,7 @@ class Robot:
             raw = self._ring.popleft()
             record = self.capture.process(raw, time.time_ns(), self._synchronised)
             if record is not None:
-                definition = partial(definition_line, raw.decoder)
-                self.writer.add(record.line, now, type_name=self._definition(raw), definition_line=definition)
+                self.writer.add(record.line, now, (raw.type_name, definition_line(raw.decoder)))
                 self.captured += 1
                 self._on_captured(record)
         if len(self._ring) < RING // 2:
@@ -197,14 +195,6 @@ class Robot:
         if now - self._losses_at >= LOSSES_EVERY:
             self._losses_at = now
             self._add_losses(now)
-
-    def _definition(self, raw: RawMessage) -> str:
-        """What names the definition in force for the type: it is said again where publishers disagree about it."""
-        decoder, changes = self._decoders.get(raw.type_name, (None, 0))
-        if decoder is not raw.decoder:
-            changes += 1
-            self._decoders[raw.type_name] = (raw.decoder, changes)
-        return f"{raw.type_name} {changes}"
 
     def _add_losses(self, now: float) -> None:
         for line in self.capture.lost(self.source.lost):

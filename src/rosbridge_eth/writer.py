@@ -5,7 +5,8 @@ comes first; one that does not fit is cut in two. After `heartbeat` seconds with
 records is sealed, so that silence can be told from withholding.
 
 Every stream begins with its `{"stream": ...}` line, and the definition of a type stands before the first
-message of that type in it. The header of each chunk names the digest of the one before, across streams too.
+message of that type in it, and again where it changes. The header of each chunk names the digest of the one
+before, across streams too.
 
 Not here: what a line says (capture), where chunks are kept (spool). No clock: `now` is seconds of a clock
 that does not jump, `wall_ms` milliseconds since 1970.
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import secrets
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from rosbridge_eth import chunk
 from rosbridge_eth.chunk import MAX_LINE, MAX_RECORDS, MAX_TIME_MS, Chunk, Log, Randomness, TooLarge
@@ -47,19 +48,15 @@ class LogWriter:
         self._period, self._heartbeat, self._compress = period, heartbeat, compress
         self._randomness = randomness
         self._now = self._last_chunk = now
-        self._definitions: dict[str, bytes] = {}
-        self._waiting: deque[tuple[float, bytes, str | None]] = deque()  # when it came, the line, its type
+        self._waiting: deque[tuple[float, bytes, tuple[str, bytes] | None]] = deque()  # as `add` was given them
         self._bytes = 0
         self.new_stream()
-
-    def __repr__(self) -> str:
-        return f"<LogWriter of stream {self.stream.hex()[:8]}, {self._number} chunks, {len(self._waiting)} lines>"
 
     def new_stream(self) -> None:
         """Begin another stream, after the server refused the present one; lines in no chunk yet go into it."""
         self.stream = self._randomness(chunk.STREAM_SIZE)
         self._number = 0
-        self._defined: set[str] = set()
+        self._defined: dict[str, bytes] = {}  # what the stream said last of a type
         self._begun = self._now
 
     def take_up(self, readers: Sequence[sm2.PublicKey]) -> None:
@@ -68,22 +65,17 @@ class LogWriter:
             self._readers = tuple(readers)
             self._defined.clear()
 
-    def add(
-        self, line: bytes, now: float, *,
-        type_name: str | None = None, definition_line: Callable[[], bytes] | None = None,
-    ) -> None:
+    def add(self, line: bytes, now: float, definition: tuple[str, bytes] | None = None) -> None:
         """Take one line in. Call `closed` afterwards, or when `next_timer` says.
 
-        type_name: whatever names the definition of the line's type; at its first line in a stream, what
-        `definition_line` returned (called once in all) goes before it.
+        definition: a type, and the line that defines it, which goes before this one unless the stream has said it
+        already, and nothing else of that type since.
         """
         _check(line)
-        if type_name is not None and type_name not in self._definitions:
-            if definition_line is None:
-                raise ValueError(f"the first line of type {type_name} comes without the type's definition")
-            self._definitions[type_name] = _check(definition_line())
+        if definition is not None:
+            _check(definition[1])
         self._now = now
-        self._waiting.append((now, line, type_name))
+        self._waiting.append((now, line, definition))
         self._bytes += len(line)
 
     def next_timer(self) -> float:
@@ -106,8 +98,7 @@ class LogWriter:
         """The rest; the last chunk says goodbye, and the writer is of no use any more."""
         chunks: list[Chunk] = []
         while not chunks or self._waiting:
-            lines = self._next_lines()
-            chunks += self._seal(lines, wall_ms, goodbye=not self._waiting)
+            chunks += self._seal(self._next_lines(), wall_ms, goodbye=not self._waiting)
         return chunks
 
     def _next_lines(self) -> list[bytes]:
@@ -115,14 +106,13 @@ class LogWriter:
         lines = [] if self._number else [self._stream_line]
         size = sum(map(len, lines))
         while self._waiting and size < MAX_JSON:
-            _, line, type_name = self._waiting[0]
+            _, line, definition = self._waiting[0]
             new = [line]
-            if type_name is not None and type_name not in self._defined:
-                new = [self._definitions[type_name], line]
+            if definition is not None and self._defined.get(definition[0]) != definition[1]:
+                new = [definition[1], line]
             if len(lines) + len(new) > MAX_RECORDS:
                 break
-            if type_name is not None:
-                self._defined.add(type_name)
+            self._defined |= [definition] if definition is not None else []
             lines += new
             size += sum(map(len, new))
             self._bytes -= len(line)
@@ -133,17 +123,14 @@ class LogWriter:
         """The lines as one chunk, or as several where they do not fit one."""
         try:
             sealed = chunk.seal(
-                self._log, self._key, lines,
-                stream=self.stream, number=self._number, previous=self._previous,
-                sealed_ms=min(max(wall_ms, 0), MAX_TIME_MS - 1),
-                readers=self._readers, goodbye=goodbye, compress=self._compress, randomness=self._randomness,
+                self._log, self._key, lines, stream=self.stream, number=self._number, previous=self._previous,
+                sealed_ms=min(max(wall_ms, 0), MAX_TIME_MS - 1), readers=self._readers, goodbye=goodbye,
+                compress=self._compress, randomness=self._randomness,
             )  # fmt: skip
         except TooLarge:
             middle = len(lines) // 2
-            return [
-                *self._seal(lines[:middle], wall_ms, goodbye=False),
-                *self._seal(lines[middle:], wall_ms, goodbye=goodbye),
-            ]
+            first = self._seal(lines[:middle], wall_ms, goodbye=False)
+            return first + self._seal(lines[middle:], wall_ms, goodbye=goodbye)
         self._number, self._previous, self._last_chunk = self._number + 1, sealed.header.digest, self._now
         return [sealed]
 

@@ -143,15 +143,3 @@ def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: 
         robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
     assert robot.captured == 10
     assert "kept for later" in robot.summary
-
-
-def test_two_definitions_under_one_type_name_are_both_in_the_log(make: Callable[[int], Robot]) -> None:
-    robot = make(0)
-    first, other = robot.source.messages[0], robot.source.messages[1]  # type: ignore[attr-defined]
-    foreign = RawMessage(other.topic, other.type_name, other.received_ns, other.raw,
-                         type(other.decoder)(other.decoder.wire, other.decoder.definition))
-    names = [robot._definition(message) for message in (first, first, foreign, foreign, first)]
-    assert names[0] == names[1] != names[2] == names[3]
-    assert names[4] not in names[:4], "the first definition is said again before a message of it"
-    robot.spool.close()
-    robot.loop.close()

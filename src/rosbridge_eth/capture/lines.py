@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
 import orjson
@@ -98,6 +99,7 @@ _MEMBERS: Final[dict[tuple[str, ...], tuple[type[Any], tuple[type, ...]]]] = {
 }  # fmt: skip
 
 
+@lru_cache(maxsize=256)
 def definition_line(decoder: Decoder) -> bytes:
     """The type line of what a decoder decodes."""
     text = decoder.definition.text
