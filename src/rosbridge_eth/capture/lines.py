@@ -15,9 +15,8 @@ reader whose JSON numbers are doubles (JavaScript) has to parse them as big inte
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import orjson
 
@@ -33,8 +32,7 @@ _TOKEN = re.compile(rb'("(?:[^"\\]|\\.)*")|-?[0-9][0-9.eE+\-]*')
 _STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*"')
 
 
-@dataclass(frozen=True, slots=True)
-class MessageLine:
+class MessageLine(NamedTuple):
     """The chosen fields of one message, with where and when.
 
     source: kind of the source: bag, sim, ros1, ros2.
@@ -52,8 +50,7 @@ class MessageLine:
     data: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class TypeLine:
+class TypeLine(NamedTuple):
     """The definition of a type, before the first message of that type in a stream."""
 
     type_name: str
@@ -71,8 +68,7 @@ class TypeLine:
             raise VerificationError(f"a type in the log cannot be read: {error}") from None
 
 
-@dataclass(frozen=True, slots=True)
-class LostLine:
+class LostLine(NamedTuple):
     """Messages of a topic that were received or due and are not in the log."""
 
     lost: int
@@ -80,8 +76,7 @@ class LostLine:
     why: str
 
 
-@dataclass(frozen=True, slots=True)
-class StreamLine:
+class StreamLine(NamedTuple):
     """The first line of a stream: the kind of source, and the software with its version."""
 
     source: str
@@ -90,7 +85,7 @@ class StreamLine:
 
 Line: TypeAlias = MessageLine | TypeLine | LostLine | StreamLine
 
-_MEMBERS: Final[dict[tuple[str, ...], tuple[type[Any], tuple[type, ...]]]] = {
+_FORMS: Final[dict[tuple[str, ...], tuple[type[Any], tuple[type, ...]]]] = {
     ("topic", "type", "source", "received_ns", "captured_ns", "clock", "data"):
         (MessageLine, (str, str, str, int, int, bool, dict)),
     ("type", "wire", "format", "definition"): (TypeLine, (str, str, str, str)),
@@ -130,17 +125,17 @@ def parse_line(line: bytes) -> Line:
     # A name twice, white space, an escape too many: what is written anew is not what was read.
     if encoded != line and _TOKEN.sub(_spelling_aside, encoded) != _TOKEN.sub(_spelling_aside, line):
         raise VerificationError("a record is not in its one form: no white space, no needless escapes, no name twice")
-    if isinstance(value, dict) and value.keys() == {"stream"}:
-        value = value["stream"]
-    made = _MEMBERS.get(tuple(value)) if isinstance(value, dict) else None
-    if made is None or (made[0] is StreamLine) != line.startswith(b'{"stream":{'):
+    is_stream = line.startswith(b'{"stream":{') and value.keys() == {"stream"}
+    members = value["stream"] if is_stream else value
+    form, kinds = _FORMS.get(tuple(members) if isinstance(members, dict) else (), (None, ()))
+    if form is None or (form is StreamLine) != is_stream:
         raise VerificationError("a record has not the members of a message, a type, a loss or a stream, in order")
-    for (name, found), kind in zip(value.items(), made[1], strict=True):
+    for (name, found), kind in zip(members.items(), kinds, strict=True):
         # A time of more than 64 bits was read as a double.
-        if type(found) is not kind or (isinstance(found, int) and not 0 <= found < 1 << 63):
+        if type(found) is not kind or (kind is int and not 0 <= found < 1 << 63):
             raise VerificationError(f"{name!r} of a record is not {_KINDS[kind]}")
-    result: Line = made[0](*value.values())
-    return result
+    line_found: Line = form._make(members.values())
+    return line_found
 
 
 _KINDS: Final[dict[type, str]] = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -229,7 +228,7 @@ def test_what_cannot_be_a_message_is_json(tmp_path, name, one):
 @pytest.mark.parametrize("received_ns", [0, 2**63 - 1])
 def test_times_that_no_bag_can_have_are_brought_into_its_range(tmp_path, name, received_ns):
     one = point(1)
-    one = one._replace(content=replace(one.content, received_ns=received_ns))
+    one = one._replace(content=one.content._replace(received_ns=received_ns))
     assert write_bag(tmp_path / name, [one]).whole == 1
 
 
