@@ -85,7 +85,8 @@ class StreamLine(NamedTuple):
 
 Line: TypeAlias = MessageLine | TypeLine | LostLine | StreamLine
 
-_FORMS: Final[dict[tuple[str, ...], tuple[type[Any], tuple[type, ...]]]] = {
+_FORMS: Final[dict[tuple[str, ...], tuple[Any, tuple[type, ...]]]] = {
+    (): (None, ()),
     ("topic", "type", "source", "received_ns", "captured_ns", "clock", "data"):
         (MessageLine, (str, str, str, int, int, bool, dict)),
     ("type", "wire", "format", "definition"): (TypeLine, (str, str, str, str)),
@@ -127,12 +128,12 @@ def parse_line(line: bytes) -> Line:
         raise VerificationError("a record is not in its one form: no white space, no needless escapes, no name twice")
     is_stream = line.startswith(b'{"stream":{') and value.keys() == {"stream"}
     members = value["stream"] if is_stream else value
-    form, kinds = _FORMS.get(tuple(members) if isinstance(members, dict) else (), (None, ()))
+    form, kinds = _FORMS.get(tuple(members) if isinstance(members, dict) else (), _FORMS[()])
     if form is None or (form is StreamLine) != is_stream:
         raise VerificationError("a record has not the members of a message, a type, a loss or a stream, in order")
     for (name, found), kind in zip(members.items(), kinds, strict=True):
         # A time of more than 64 bits was read as a double.
-        if type(found) is not kind or (kind is int and not 0 <= found < 1 << 63):
+        if type(found) is not kind or (isinstance(found, int) and not 0 <= found < 1 << 63):
             raise VerificationError(f"{name!r} of a record is not {_KINDS[kind]}")
     line_found: Line = form._make(members.values())
     return line_found

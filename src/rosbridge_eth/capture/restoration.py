@@ -25,7 +25,7 @@ from rosbridge_eth.errors import SourceError, VerificationError
 _SECOND: Final = 10**9
 _UINT32: Final = 2**32
 _BYTES: Final = frozenset({"uint8", "char", "byte"})
-_NOT_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+NOT_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 Builder: TypeAlias = Callable[[Any, list[str]], Any]
 """Takes the JSON value (or _ABSENT) and the list to which paths of what is missing are added."""
@@ -206,8 +206,8 @@ def _string(path: str) -> Builder:
 
 def _checked(data: Any, kind: numpy.dtype[Any], path: str) -> Any:
     if kind.kind == "f":
-        if isinstance(data, str) and data in _NOT_FINITE:
-            return _NOT_FINITE[data]
+        if isinstance(data, str) and data in NOT_FINITE:
+            return NOT_FINITE[data]
         if type(data) is float and abs(data) <= float(numpy.finfo(kind).max):
             return data
     elif kind.kind == "b":

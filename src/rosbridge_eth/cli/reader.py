@@ -1,13 +1,14 @@
-"""`read`: what a robot wrote, proven, from the chain alone."""
+"""`read` and `compare`: what a robot wrote, proven, from the chain alone."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
@@ -19,11 +20,24 @@ from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
 
 if TYPE_CHECKING:
-    from rosbridge_eth.reading import ProvenRecord
+    from rosbridge_eth.reading import Reading
 
 
 def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl")(read)
+    app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
+
+
+RobotName: TypeAlias = Annotated[str, typer.Argument(help="The robot's name.")]
+Nodes: TypeAlias = Annotated[
+    list[str] | None, typer.Option("--node", help="Ask these nodes, not those of reader.toml.")
+]
+Confirmations: TypeAlias = Annotated[
+    int, typer.Option(min=1, max=100_000, help="Read up to the block that has so many, itself counted.")
+]
+Confirm: TypeAlias = Annotated[
+    bool, typer.Option("--confirm", help="The fingerprints of new certificates are compared and right.")
+]
 
 
 def _time(text: str | None) -> int | None:
@@ -34,84 +48,140 @@ def _time(text: str | None) -> int | None:
 
 
 def read(
-    robot: Annotated[str, typer.Argument(help="The robot's name.")],
+    robot: RobotName,
     home: ReaderHomeOption = READER_HOME,
     topic: Annotated[str | None, typer.Option(help="Only this topic.")] = None,
     from_: Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")] = None,
     to: Annotated[str | None, typer.Option(help="Only what was received before this time.")] = None,
     at: Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")] = None,
     bag: Annotated[Path | None, typer.Option(help="Write NAME.bag (ROS 1), NAME.mcap, NAME.db3 or a folder.")] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write a table.")] = None,
+    table: Annotated[Path | None, typer.Option(help="Write NAME.csv or NAME.parquet.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw the trajectory: .png, .svg or .pdf.")] = None,
-    node: Annotated[list[str] | None, typer.Option(help="Ask these nodes, not those of reader.toml.")] = None,
-    confirm: Annotated[
-        bool, typer.Option("--confirm", help="The fingerprints of new certificates are compared and right.")
-    ] = False,
+    field: Annotated[
+        list[str] | None, typer.Option(help="Draw this field over time instead, such as pose.pose.position.x.")
+    ] = None,
+    node: Nodes = None,
+    confirmations: Confirmations = 1,
+    confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
     json: Json = False,
 ) -> None:
     """Fetch a robot's log from the chain, prove it, open it, and give its records as JSON lines, bag, table or plot.
 
-    Exits with 9 where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record
-    of it is sealed for others.
+    What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
+    where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
+    sealed for others.
     """
-    from rosbridge_eth.identity import Trust, load_identity
-    from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.reading import Bookmarks, outputs, read_robot
+    from rosbridge_eth.reading import Choice, outputs
+    from rosbridge_eth.reading.verdict import shown
 
-    choice = outputs.Choice(topic, _time(from_), _time(to), _time(at))
+    choice = Choice(topic, _time(from_), _time(to), _time(at))
     if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
         raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
     if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
         raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
+    if field and plot is None:
+        raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     place = ReaderHome(home).require()
+    for path, check in ((bag, outputs.check_bag), (table, outputs.check_table), (plot, outputs.check_picture)):
+        if path is not None:
+            check(path)
+    picture = outputs.Curves(field) if field else outputs.Trajectory()
+    chosen = 0
+    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said), ExitStack() as files:
+        sinks: list[Any] = [files.enter_context(outputs.bag(bag)).write] if bag is not None else []
+        if table is not None:
+            sinks.append(files.enter_context(outputs.table(table)).write)
+        if plot is not None:
+            sinks.append(picture.write)
+        if not sinks and not json:
+            sinks.append(lambda record: print(outputs.json_line(record), end=""))
+        for record in reading.records(choice):
+            chosen += 1
+            for sink in sinks:
+                sink(record)
+        said |= {"chosen": chosen}
+    if json:
+        print_json(said)
+    if topic is not None and chosen == 0 and topic not in reading.topics:
+        there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
+        talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
+    _require_sound(place, robot, said)
+    if plot is not None and not picture.draw(plot):
+        what = "a number there" if field else "a position"
+        raise ConfigError(f"{plot} shows nothing: none of the {chosen} chosen records holds {what}")
+
+
+def compare(
+    bag: Annotated[Path, typer.Argument(help="A recording: a .bag, .mcap or .db3 file, or a ROS 2 bag's folder.")],
+    robot: RobotName,
+    home: ReaderHomeOption = READER_HOME,
+    topic: Annotated[list[str] | None, typer.Option(help="Only these topics; each must be on the chain.")] = None,
+    some: Annotated[
+        bool, typer.Option("--some", help="The robot captures only some messages: those it does not are no difference.")
+    ] = False,
+    node: Nodes = None,
+    confirmations: Confirmations = 1,
+    confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None,
+    json: Json = False,
+) -> None:
+    """Hold a recording of your own against what the chain has of the same messages, field by field.
+
+    Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
+    """
+    from rosbridge_eth.reading import compare as comparing
+
+    place = ReaderHome(home).require()
+    choice = comparing.time_of(bag)
+    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+        made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
+        said |= asdict(made)
+    if json:
+        print_json(said)
+    for line in made.differences:
+        talk(line)
+    if made.wrong > len(made.differences):
+        talk(f"and {made.wrong - len(made.differences):,} differences more")
+    if made.absent:
+        talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
+    talk(f"{made.equal:,} records are equal to the bag's; {made.wrong:,} differences")
+    _require_sound(place, robot, said)
+    if made.wrong or not made.equal:
+        raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
+
+
+@contextmanager
+def _reading(
+    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int, confirm: bool, file: Path | None
+) -> Iterator[tuple[Reading, dict[str, Any]]]:
+    """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
+    from rosbridge_eth.identity import Trust, load_identity
+    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.reading import Bookmarks, read_robot
+
     config = load_reader_config(place.config)
-    if bag is not None:
-        outputs.check_bag(bag)
-    if csv is not None:
-        outputs.check_table(csv)
-    trajectory = None if plot is None else outputs.Trajectory()
-    if plot is not None:
-        outputs.check_picture(plot)
-    passphrase = read_passphrase("reader", "Passphrase of the reader", file=passphrase_file)
-    identity, roots = load_identity(config.identity, passphrase)
-    ledgers = [Ledger.connect(url, config) for url in node or config.chain]
-    bookmarks = Bookmarks(place.path / "bookmarks.json")
-    chosen, topics = 0, set[str]()
+    identity, roots = load_identity(config.identity, read_passphrase("reader", "Passphrase of the reader", file=file))
+    ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
+    bookmarks, said = Bookmarks(place.path / "bookmarks.json"), dict[str, Any]()
     with ExitStack() as stack:
         for ledger in ledgers:
             stack.callback(ledger.close)
         reading = read_robot(
-            ledgers, robot, trust=Trust(roots), reader=identity.encryption_key, now=time.time(), bookmarks=bookmarks
-        )
-        sinks = [stack.enter_context(outputs.bag(bag)).write] if bag is not None else []
-        if csv is not None:
-            sinks.append(stack.enter_context(outputs.table(csv)).write)
-        if trajectory is not None:
-            sinks.append(trajectory.write)
-        if not sinks and not json:
-            sinks.append(lambda record: print(outputs.json_line(record), end=""))
-        for record in choice.choose(_noting(reading.records(), topics)):
-            chosen += 1
-            for sink in sinks:
-                sink(record)
+            ledgers, robot, trust=Trust(roots), reader=identity.encryption_key, now=time.time(), bookmarks=bookmarks,
+            cache=place.path / "proven", confirmations=confirmations,
+        )  # fmt: skip
+        stack.callback(reading.close)
+        yield reading, said
         verdict = reading.verdict()
     reading.keep(bookmarks, confirm=confirm)
-    if json:
-        print_json(verdict.as_json() | {"chosen": chosen})
+    said |= verdict.as_json()
     for line in verdict.lines():
         talk(line)
-    if topic is not None and chosen == 0 and topic not in topics:
-        talk(f"nothing was read on {topic}; what was read is on: {', '.join(sorted(topics)) or 'no topic'}")
-    if not verdict.sound:
+
+
+def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
+    if not said["sound"]:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
-    if not verdict.records and "no-grant" in verdict.counts:
+    if not said["records"] and "no-grant" in said["counts"]:
         raise IdentityError(f"nothing of {robot} is sealed for this reader; put {place.public} into its `readers/`")
-    if plot is not None and trajectory is not None and not trajectory.draw(plot):
-        raise ConfigError(f"{plot} is not drawn: none of the {chosen} chosen records holds a position")
-
-
-def _noting(records: Iterator[ProvenRecord], topics: set[str]) -> Iterator[ProvenRecord]:
-    for record in records:
-        topics.add(record.content.topic)
-        yield record

@@ -2,11 +2,12 @@
 
 from rosbridge_eth.reading.fetch import Reading, read_robot
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Finding, Kind, Verdict
-from rosbridge_eth.reading.verify import Place, ProvenChunk, ProvenRecord, Verifier
+from rosbridge_eth.reading.verify import Choice, Place, ProvenChunk, ProvenRecord, Verifier
 
 __all__ = [
     "Bookmark",
     "Bookmarks",
+    "Choice",
     "Finding",
     "Kind",
     "Place",

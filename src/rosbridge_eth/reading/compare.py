@@ -1,16 +1,17 @@
 """Records that were read back, held against a recording of the same messages, field by field.
 
 The recording is a bag that this robot replayed, or that was recorded beside it. Both sides are taken in order per
-topic, so a record that is missing, doubled or out of its place is a difference.
+topic, so a record that is missing, doubled or out of its place is a difference. A record of a replay has the bag's
+receive time; one of a live robot was received by it and by the recorder at times of their own, so there it is the
+content that says which message it is, among those of a SLACK around. Memory holds the messages of twice that.
 """
 
 from __future__ import annotations
 
-import threading
 from base64 import b64encode
-from collections import defaultdict
+from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -18,49 +19,110 @@ from typing import Any
 import numpy
 
 from rosbridge_eth.capture import MessageLine, RawMessage
+from rosbridge_eth.capture.definitions import attribute_name
+from rosbridge_eth.config.values import time_text
 from rosbridge_eth.reading.verdict import shown
+from rosbridge_eth.reading.verify import Choice
 from rosbridge_eth.sources import BagSource, Selection
 from smcrypto import sm3
 
 MAX_DIFFERENCES = 100
+SLACK = 1_000_000_000  # ns
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Comparison:
-    """`equal` records, and a sentence for each that is not, MAX_DIFFERENCES of them at most."""
+    """`equal` records, `wrong` ones, and a sentence for each of those, MAX_DIFFERENCES of them at most.
 
-    equal: int
-    differences: tuple[str, ...]
+    absent: topics of which there is no record.
+    """
+
+    equal: int = 0
+    wrong: int = 0
+    absent: list[str] = field(default_factory=list)
+    differences: list[str] = field(default_factory=list)
+
+    def differ(self, topic: str, at_ns: int, why: str) -> None:
+        self.wrong += 1
+        if self.wrong <= MAX_DIFFERENCES:
+            self.differences.append(f"{shown(topic)} at {time_text(at_ns)}: {shown(why)}")
 
 
-def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine]) -> Comparison:
-    """Hold each record against the bag's own message: the same receive time, and each captured field equal."""
-    expected: dict[str, list[RawMessage]] = defaultdict(list)
-    source = BagSource(bag, Selection(topics), speed=None)
+def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *, some: bool = False) -> Comparison:
+    """Hold each record on the topics against the bag's own message: each captured field equal, and none missing.
+
+    Records that were received before the bag begins or after it ends are not looked at.
+    topics: none for all of the bag's; one of these without a single record is `absent`, and no difference.
+    some: the robot captured only some of the messages, by a rate or period; those that it did not are no difference.
+    """
+    source = BagSource(bag, Selection(topics or ["/**"]))
+    made, messages = Comparison(), source.messages()
+    waiting: dict[str, deque[RawMessage]] = {topic: deque() for topic in source.decoders()}
+    unmet = dict.fromkeys(waiting, 0)  # of the topics that had no record yet, messages that should have had one
+
+    def missing(raw: RawMessage) -> None:
+        if raw.topic in unmet:
+            unmet[raw.topic] += 1
+        elif not some:
+            made.differ(raw.topic, raw.received_ns, "the chain has no record of this message")
+
     try:
-        source.run(lambda raw: expected[raw.topic].append(raw), threading.Event())
+        (first, last), ahead = source.span, next(messages, None)
+        for record in (record for record in records if record.topic in waiting):
+            topic, time, mine = record.topic, record.received_ns, waiting[record.topic]
+            if not first - SLACK <= time <= last + SLACK:
+                continue
+            while ahead is not None and ahead.received_ns <= time + SLACK:
+                waiting[ahead.topic].append(ahead)
+                ahead = next(messages, None)
+            for old in waiting.values():
+                while old and old[0].received_ns < time - SLACK:
+                    missing(old.popleft())
+            before, wrong = _message_of(record, mine)
+            for _ in range(before):
+                missing(mine.popleft())
+            if mine and (wrong is None or mine[0].received_ns == time):
+                mine.popleft()
+            if (count := unmet.pop(topic, 0)) and not some:
+                made.differ(topic, time, f"the chain has no record of the {count:,} messages before this one")
+            if wrong is None:
+                made.equal += 1
+            else:
+                made.differ(topic, time, wrong)
+        for rest in (*waiting.values(), [] if ahead is None else [ahead], messages):
+            for raw in rest:
+                missing(raw)
     finally:
         source.close()
-    got: dict[str, list[MessageLine]] = defaultdict(list)
-    for record in records:
-        got[record.topic].append(record)
-    equal, differences = 0, []
-    for topic in sorted(expected.keys() | got.keys()):
-        if len(got[topic]) != len(expected[topic]):
-            differences.append(f"{topic}: the bag has {len(expected[topic])} messages, {len(got[topic])} came back")
-        for raw, record in zip(expected[topic], got[topic], strict=False):
-            wrong = _difference(record, raw)
-            if wrong is None:
-                equal += 1
-            else:
-                differences.append(f"{topic} at {raw.received_ns}: {wrong}")
-    return Comparison(equal, tuple(shown(text) for text in differences[:MAX_DIFFERENCES]))
+    for topic, count in unmet.items():
+        if topics and count:
+            made.differ(topic, first, f"the chain has no record of any of the {count:,} messages on this topic")
+        else:
+            made.absent.append(shown(topic))
+    return made
 
 
-def _difference(record: MessageLine, raw: RawMessage) -> str | None:
-    if record.received_ns != raw.received_ns:
-        return f"received at {record.received_ns} instead"
-    return _wrong(record.data, raw.decoder.decode(raw.raw), "")
+def time_of(bag: Path) -> Choice:
+    """The records that can be of the messages in a bag."""
+    source = BagSource(bag, Selection(["/**"]))
+    source.close()
+    first, last = source.span
+    return Choice(from_ns=first - SLACK, to_ns=last + SLACK + 1)
+
+
+def _message_of(record: MessageLine, waiting: Sequence[RawMessage]) -> tuple[int, str | None]:
+    """How many messages come before that of the record, and what is wrong with it; all if none is like it."""
+    same = [at for at, raw in enumerate(waiting) if raw.received_ns == record.received_ns]
+    wrong, nearest = "the bag has no such message", 2 * SLACK
+    for at in same or range(len(waiting)):
+        found = _wrong(record.data, waiting[at].decoder.decode(waiting[at].raw), "")
+        if found is None:
+            return at, None
+        if (away := abs(waiting[at].received_ns - record.received_ns)) < nearest:
+            wrong, nearest = found, away
+    if same:
+        return same[0], wrong
+    return 0, wrong if not waiting else f"the bag has no such message; in the nearest, {wrong}"
 
 
 def _wrong(value: Any, message: Any, path: str) -> str | None:
@@ -70,13 +132,13 @@ def _wrong(value: Any, message: Any, path: str) -> str | None:
         right = {"sm3": sm3.digest(content).hex(), "length": len(content)}
         return None if value == right else f"{path} is a digest of something else"
     if isinstance(value, dict):
-        if not value:
+        if not value and getattr(message, "__dataclass_fields__", True):
             return f"{path or 'the record'} is empty"
-        parts = (_wrong(part, getattr(message, name), f"{path}.{name}".lstrip(".")) for name, part in value.items())
+        parts = (_wrong(part, _member(message, name), f"{path}.{name}".lstrip(".")) for name, part in value.items())
         return next((found for found in parts if found is not None), None)
     if isinstance(value, list):
-        if len(value) != len(message):
-            return f"{path} has {len(value)} elements instead of {len(message)}"
+        if not isinstance(message, list | numpy.ndarray) or len(value) != len(message):
+            return f"{path} has {len(value)} elements, not as the message"
         parts = (_wrong(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(value, message, strict=True)))
         return next((found for found in parts if found is not None), None)
     if hasattr(message, "nanosec"):
@@ -86,3 +148,10 @@ def _wrong(value: Any, message: Any, path: str) -> str | None:
     elif isinstance(message, float) and not isfinite(message):
         message = {inf: "Infinity", -inf: "-Infinity"}.get(message, "NaN")
     return None if value == message else f"{path} is {value!r} instead of {message!r}"
+
+
+def _member(message: Any, name: str) -> Any:
+    """A message's field, or an array's element of which only some were captured; None for what is not there."""
+    if isinstance(message, list | numpy.ndarray):
+        return message[int(name)] if name.isdecimal() and int(name) < len(message) else None
+    return getattr(message, attribute_name(name), None)

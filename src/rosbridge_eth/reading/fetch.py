@@ -3,37 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
+from rosbridge_eth.reading.cache import Cache, open_cache
 from rosbridge_eth.reading.verdict import Bookmarks, Verdict, shown
-from rosbridge_eth.reading.verify import HEARTBEAT, ProvenChunk, ProvenRecord, Verifier
+from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Choice, ProvenChunk, ProvenRecord, Verifier
 from smcrypto import sm2
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger.contract import Ledger, Standing
+    from rosbridge_eth.ledger.contract import Block, DataEvent, Ledger, Standing
 
 MARGIN = 128
-"""Blocks that are asked for again before a bookmark: a reorganisation moves batches to other blocks."""
+"""Blocks above a batch after which it is kept; the newer ones are asked for again, since a chain may replace them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A robot's log while it is read: first `chunks` or `records` to the end, then `verdict`, then `keep`."""
+    """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
+
+    kept: of earlier readings; `chunks` are those behind it. topics: that were read so far.
+    """
 
     verifier: Verifier
     chunks: Iterator[ProvenChunk]
-    nodes: tuple[str, ...]
+    nodes: Sequence[str]
+    kept: Cache | None = None
+    topics: set[str] = field(default_factory=set)
 
-    def records(self) -> Iterator[ProvenRecord]:
+    def records(self, choice: Choice = EVERYTHING) -> Iterator[ProvenRecord]:
+        return choice.choose(self._records(choice))
+
+    def _records(self, choice: Choice) -> Iterator[ProvenRecord]:
+        if self.kept is not None:
+            self.topics.update(self.kept.topics())
+            yield from self.kept.records(choice)
         for chunk in self.chunks:
+            self.topics.update(record.content.topic for record in chunk.records)
             yield from chunk.records
 
     def verdict(self) -> Verdict:
         return self.verifier.verdict(self.nodes)
+
+    def close(self) -> None:
+        if self.kept is not None:
+            self.kept.close()
 
     def keep(self, bookmarks: Bookmarks, *, confirm: bool = False) -> None:
         """Write the bookmark. confirm: the reader has compared the fingerprints of new certificates."""
@@ -50,36 +68,80 @@ def read_robot(
     reader: sm2.PrivateKey | None,
     now: float,
     bookmarks: Bookmarks | None = None,
-    resume: bool = False,
+    cache: Path | None = None,
     confirmations: int = 1,
     heartbeat: float = HEARTBEAT,
 ) -> Reading:
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
-    ledgers: the contract on one node or several. resume: only what is new since the bookmark. confirmations: read up to
-    the block that has so many, itself counted. Raises ChainError; ConfigError for nodes of different ledgers;
-    IdentityError for a name that is none, or that the contract does not know.
+    ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next
+    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted. Raises
+    ChainError; ConfigError for nodes of different ledgers; IdentityError for a name that the contract does not know.
     """
     tk = robot_id(check_name(name))
-    ledger, block, standing, nodes = _best(ledgers, tk, confirmations)
+    ledger, block, standing, told = _best(ledgers, tk, confirmations)
     if standing.account is None:
         raise IdentityError(
             f"no robot of the name {name} is registered in the contract {ledger.contract}; the operator's `status`"
             " lists the names there are"
         )
     log = Log(ledger.ledger, tk)
-    mark = None if bookmarks is None else bookmarks.get(log)
     registrations = ledger.registrations(tk, standing)
+    kept = None if cache is None or reader is None else _kept(cache, name, log, reader, trust, ledger, block, told)
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=mark, resume=resume, heartbeat=heartbeat,
+        block_time=ledger.block_time, now=now, mark=None if bookmarks is None else bookmarks.get(log),
+        at=None if kept is None else kept.progress, links=None if kept is None else kept.links, heartbeat=heartbeat,
         elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log),
     )  # fmt: skip
-    first_block = registrations[0].block if registrations else 0
-    if resume and mark is not None:
-        first_block = max(first_block, mark.block - MARGIN)
+    first_block = max(registrations[0].block if registrations else 0, kept.next_block if kept else 0)
     events = ledger.data_events(tk, first_block, standing.data_block)
-    return Reading(verifier, _settled(ledger, block, verifier.read(events)), nodes)
+    if kept is None:
+        chunks = verifier.read(events)
+    else:
+        chunks = _keeping(kept, verifier, events, ledger.block(max(0, block - MARGIN)))
+    return Reading(verifier, _settled(ledger, block, chunks), told, kept)
+
+
+def _kept(
+    folder: Path, name: str, log: Log, reader: sm2.PrivateKey, trust: Trust, ledger: Ledger, block: int, told: list[str]
+) -> Cache | None:
+    """What earlier readings have proven, if the chain up to there is the same; empty if it is another one."""
+    kept = open_cache(folder, name, log, reader, trust)
+    if kept is None or kept.block == 0 or (kept.block <= block and ledger.block(kept.block).hash == kept.hash):
+        return kept
+    if kept.block <= block:
+        told.append(f"the chain has another block {kept.block} than at the reading before: all of it was read anew")
+        return kept.emptied()
+    told.append(f"node {shown(ledger.url)} has only {block} blocks of the {kept.block} that were read before")
+    kept.close()
+    return None
+
+
+def _keeping(kept: Cache, verifier: Verifier, events: Iterator[DataEvent], final: Block) -> Iterator[ProvenChunk]:
+    """The chunks of the events; what is in final blocks is kept as it is proven, unless the node is not honest."""
+
+    def commit(next_block: int) -> None:
+        if verifier.honest and final.number > 0:
+            kept.commit(verifier.progress(), next_block, final.number, final.hash)
+
+    def finals() -> Iterator[DataEvent]:
+        for event in events:
+            if event.block > final.number:
+                commit(final.number + 1)
+                yield event
+                break
+            yield event
+        else:
+            commit(final.number + 1)
+        yield from events
+
+    for chunk in verifier.read(finals()):
+        if chunk.place.block <= final.number and verifier.honest:
+            kept.add(chunk)
+            if kept.full:
+                commit(chunk.place.block)
+        yield chunk
 
 
 def _settled(ledger: Ledger, block: int, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
@@ -92,7 +154,7 @@ def _settled(ledger: Ledger, block: int, chunks: Iterator[ProvenChunk]) -> Itera
         )
 
 
-def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, int, Standing, tuple[str, ...]]:
+def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, int, Standing, list[str]]:
     """The node with the highest count, the block up to which it is read, and what the others say otherwise."""
     answers: list[tuple[Ledger, int, Standing]] = []
     told: list[str] = []
@@ -115,4 +177,4 @@ def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Led
             told.append(f"node {shown(ledger.url)} shows {standing.chunks:,} chunks only, in block {block}")
         elif standing.tail != best[2].tail:
             told.append(f"node {shown(ledger.url)} has another last chunk, in block {block}: the nodes contradict")
-    return *best, tuple(told)
+    return *best, told

@@ -1,4 +1,4 @@
-"""What a reader makes of proven records: JSON lines, CSV, a bag that ROS tools open, a picture of the trajectory.
+"""What a reader makes of proven records: JSON lines, a table, a bag that ROS tools open, a picture.
 
 Each output takes records one by one, so that one pass over a log fills them all, and stands under its name only when
 it is whole. A bag says no more than what was recorded:
@@ -17,15 +17,24 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import islice
 from math import isfinite
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
+
+import numpy
+from rosbags.interfaces import Nodetype
 
 from rosbridge_eth.capture import Restoration, TypeLine, Wire, decoder_for_known
+from rosbridge_eth.capture.definitions import TIME
+from rosbridge_eth.capture.restoration import NOT_FINITE
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ConfigError, SourceError, VerificationError
 from rosbridge_eth.reading.verdict import printable, shown
@@ -36,41 +45,14 @@ MAX_NOTES: Final = 1_000
 MAX_COLUMNS: Final = 4_096
 MAX_TRACKS: Final = 32
 """Topics in one picture; what is on further ones is left out."""
+MAX_POINTS: Final = 1 << 13
+_BATCH: Final = 4_096  # rows of a Parquet file that are made at once
 _FARTHEST: Final = 1e12
 """Metres from the origin; a position beyond is no position."""
 _STRING: Final = "std_msgs/msg/String"
 _LAST_TIME: Final = {Wire.ROS1: 2**32 * 10**9 - 1, Wire.CDR: 2**63 - 1}
 _BAGS: Final = "NAME.bag (ROS 1), NAME.mcap or NAME.db3 (ROS 2, one file), or NAME (ROS 2, a folder)"
 _PICTURES: Final = "name it .png, .svg or .pdf"
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Which records are wanted: a topic, and times (nanoseconds since 1970, by the robot's receive time)."""
-
-    topic: str | None = None
-    from_ns: int | None = None
-    to_ns: int | None = None
-    at_ns: int | None = None
-
-    def choose(self, records: Iterable[ProvenRecord]) -> Iterator[ProvenRecord]:
-        """The chosen ones as they come; with `at_ns` the last one of each topic up to then, when all have come."""
-        last: dict[str, ProvenRecord] = {}
-        for record in records:
-            if self._wants(record.content.topic, record.content.received_ns):
-                if self.at_ns is None:
-                    yield record
-                else:
-                    last[record.content.topic] = record
-        yield from last.values()
-
-    def _wants(self, topic: str, time: int) -> bool:
-        return (
-            (self.topic is None or topic == self.topic)
-            and (self.from_ns is None or time >= self.from_ns)
-            and (self.to_ns is None or time < self.to_ns)
-            and (self.at_ns is None or time <= self.at_ns)
-        )
 
 
 # JSON lines
@@ -116,48 +98,74 @@ def _new(path: Path, kind: str) -> None:
         raise ConfigError(f"{path.parent} is no folder; make it first")
 
 
-# CSV
+# Tables
 
 
 def check_table(path: Path) -> None:
     """ConfigError unless a table can be written there."""
-    if path.suffix != ".csv":
-        raise ConfigError(f"{path}: a table is a .csv file")
+    if path.suffix not in (".csv", ".parquet"):
+        raise ConfigError(f"{path}: a table is a .csv or a .parquet file")
+    if path.suffix == ".parquet" and not find_spec("pyarrow"):
+        raise ConfigError(f"{path}: Parquet needs pyarrow; install pysmcrypto[parquet], or name a .csv file")
     _new(path, "table")
 
 
-_FIXED: Final = (
-    "topic", "type", "source", "received_ns", "captured_ns", "clock", "chunk", "record", "block", "transaction",
-)  # fmt: skip
+_FIXED: Final = {
+    "topic": "text", "type": "text", "source": "text", "received_ns": "time", "captured_ns": "time", "clock": "bool",
+    "stream": "text", "number": "int", "chunk": "int", "record": "int", "block": "int", "transaction": "text",
+}  # fmt: skip
 """Columns of every table; after them those of the messages' fields, a dot between the levels."""
 
 
 class Table:
-    """Rows are kept in a file until all columns are known."""
+    """Rows are kept in a file until all columns, and what kinds of values they have, are known."""
 
     def __init__(self, rows: Any) -> None:
         self._rows = rows
-        self._columns: dict[str, None] = {}
+        self._columns: dict[str, set[str]] = {}
+        self._times: dict[TypeLine | None, frozenset[str]] = {None: frozenset()}
 
     def write(self, record: ProvenRecord) -> None:
         content, place = record.content, record.place
-        cells = dict(_cells(content.data, ""))
-        for column in cells:
-            if len(self._columns) < MAX_COLUMNS:
-                self._columns.setdefault(column)
+        if record.definition not in self._times:
+            self._times[record.definition] = _time_fields(record.definition)
+        times, cells = self._times[record.definition], dict(_cells(content.data, ""))
+        for column, value in cells.items():
+            if column in self._columns or len(self._columns) < MAX_COLUMNS:
+                kind = _kind(value)
+                self._columns.setdefault(column, set()).add("time" if kind == "int" and column in times else kind)
         row = [
             content.topic, content.type_name, content.source, content.received_ns, content.captured_ns, content.clock,
-            place.chunk, record.number, place.block, "0x" + place.transaction.hex(), cells,
+            place.stream.hex(), place.number, place.chunk, record.number, place.block, "0x" + place.transaction.hex(),
+            cells,
         ]  # fmt: skip
         self._rows.write(json.dumps(row) + "\n")
 
-    def copy_to(self, file: Any) -> None:
-        writer = csv.writer(file)
-        writer.writerow([*_FIXED, *(_cell(column) for column in self._columns)])
+    def _read(self) -> Iterator[list[Any]]:
         self._rows.seek(0)
         for row in self._rows:
             *fixed, cells = json.loads(row)
-            writer.writerow(map(_cell, [*fixed, *(cells.get(column, "") for column in self._columns)]))
+            yield [*fixed, *(cells.get(column) for column in self._columns)]
+
+    def write_csv(self, path: Path) -> None:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([_cell(column) for column in (*_FIXED, *self._columns)])
+            writer.writerows(map(_cell, row) for row in self._read())
+
+    def write_parquet(self, path: Path) -> None:
+        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+        kinds = [{kind} for kind in _FIXED.values()] + list(self._columns.values())
+        types, values = zip(*(_arrow(pyarrow, found - {""}) for found in kinds), strict=True)
+        names = [column.removesuffix("_ns") for column in _FIXED] + list(map(printable, self._columns))
+        schema, rows = pyarrow.schema(zip(names, types, strict=True)), self._read()
+        with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+            while batch := list(islice(rows, _BATCH)):
+                columns = [
+                    pyarrow.array([None if cell is None else value(cell) for cell in column], kind)
+                    for column, value, kind in zip(zip(*batch, strict=True), values, types, strict=True)
+                ]
+                writer.write_batch(pyarrow.record_batch(columns, schema=schema))
 
 
 def _cells(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -165,11 +173,60 @@ def _cells(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
         if isinstance(value, dict):
             yield from _cells(value, f"{path}{name}.")
         else:
-            yield path + name, json.dumps(value) if isinstance(value, list) else value
+            yield path + name, value
+
+
+def _kind(value: Any) -> str:
+    """Of a cell: bool, int, float, nan (text that may stand for a float), text, ints, floats, json; "" for any."""
+    if isinstance(value, list):
+        kinds = set(map(_kind, value))
+        return "ints" if kinds == {"int"} else "" if not kinds else "floats" if kinds <= _NUMBERS else "json"
+    if isinstance(value, str):
+        return "nan" if value in NOT_FINITE else "text"
+    if type(value) is int:
+        return "int" if -(2**63) <= value < 2**63 else "json"
+    return {bool: "bool", float: "float"}.get(type(value), "json")
+
+
+_NUMBERS: Final = {"int", "float", "nan"}
+
+
+def _arrow(pyarrow: Any, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
+    """The type of a column whose cells are of these kinds, and what makes its value of a cell."""
+    if kinds == {"time"}:
+        return pyarrow.timestamp("ns", tz="UTC"), int
+    if kinds == {"bool"}:
+        return pyarrow.bool_(), bool
+    if kinds and kinds <= {"int", "time"}:
+        return pyarrow.int64(), int
+    if kinds and kinds <= _NUMBERS:
+        return pyarrow.float64(), float
+    if kinds == {"ints"}:
+        return pyarrow.list_(pyarrow.int64()), list
+    if kinds and kinds <= {"ints", "floats"}:
+        return pyarrow.list_(pyarrow.float64()), lambda cell: list(map(float, cell))
+    return pyarrow.string(), str if kinds <= {"text", "nan"} else json.dumps
+
+
+def _time_fields(definition: TypeLine | None) -> frozenset[str]:
+    """Paths of a type's fields that are points in time."""
+    try:
+        fields = {} if definition is None else definition.decoder().fields
+    except VerificationError:
+        return frozenset()
+
+    def walk(type_name: str, path: str) -> Iterator[str]:
+        for name, (node, kind) in fields.get(type_name, ()):
+            if node == Nodetype.NAME:
+                yield from [path + name] if kind == TIME else walk(str(kind), f"{path}{name}.")
+
+    return frozenset(walk(definition.type_name, "")) if definition else frozenset()
 
 
 def _cell(value: Any) -> Any:
     """Text without what acts on a terminal, and not to be taken for a formula by a spreadsheet."""
+    if isinstance(value, list):
+        return json.dumps(value)
     if not isinstance(value, str):
         return value
     text = printable(value)
@@ -178,13 +235,12 @@ def _cell(value: Any) -> Any:
 
 @contextmanager
 def table(path: Path) -> Iterator[Table]:
-    """A CSV file: a row each record, a column each field that is no message; arrays as JSON in one cell."""
+    """A row each record, a column each field that is no message; arrays as JSON in one cell, in Parquet as lists."""
     check_table(path)
     with _whole(path) as within, tempfile.TemporaryFile("w+", dir=within.parent) as rows:
         made = Table(rows)
         yield made
-        with within.open("w", newline="", encoding="utf-8") as file:
-            made.copy_to(file)
+        (made.write_csv if path.suffix == ".csv" else made.write_parquet)(within)
 
 
 # Bags
@@ -304,7 +360,7 @@ class Bag:
             self._put_string(NOTES, text, self._last)
 
 
-# The trajectory
+# Pictures
 
 
 def check_picture(path: Path) -> str:
@@ -319,44 +375,111 @@ def check_picture(path: Path) -> str:
     return kind
 
 
+_Point = TypeVar("_Point", bound=tuple[float, ...])
+
+
+class _Points(Generic[_Point]):
+    """Any number of points as at most MAX_POINTS: neighbours become one by `merge`, all over the length alike."""
+
+    def __init__(self, merge: Callable[[_Point, _Point], _Point]) -> None:
+        self._merge, self._each = merge, 1
+        self.count, self.kept = 0, list[_Point]()
+
+    def add(self, point: _Point) -> None:
+        if self.count % self._each:
+            self.kept[-1] = self._merge(self.kept[-1], point)
+        else:
+            if len(self.kept) == MAX_POINTS:
+                self.kept = list(map(self._merge, self.kept[::2], self.kept[1::2]))
+                self._each *= 2
+            self.kept.append(point)
+        self.count += 1
+
+
 class Trajectory:
     """Where the robot was, as seen from above. tracks: of each topic that has positions, (received_ns, x, y)."""
 
     def __init__(self) -> None:
-        self.tracks: dict[str, list[tuple[int, float, float]]] = {}
+        self.tracks: dict[str, _Points[tuple[float, float, float]]] = {}
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
         point = _position(content.data)
         if point is not None and (content.topic in self.tracks or len(self.tracks) < MAX_TRACKS):
-            self.tracks.setdefault(content.topic, []).append((content.received_ns, *point))
+            track = self.tracks.setdefault(content.topic, _Points(lambda kept, _: kept))
+            track.add((content.received_ns, *point))
 
     def draw(self, path: Path) -> int:
         """Draw, in the format of the name's ending; how many positions there are. Without any, the picture says so."""
-        import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        with _figure(path, 7, 6) as figure:
+            if not self.tracks:
+                figure.text(0.5, 0.5, "no positions in these records", ha="center", va="center")
+                return 0
+            axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="x in m", ylabel="y in m")
+            for topic, points in self.tracks.items():
+                _draw_track(axes, shown(topic, 60), points.count, sorted(points.kept))
+            axes.grid(alpha=0.3)
+            axes.legend(loc="best", fontsize="small")
+        return sum(points.count for points in self.tracks.values())
 
-        kind = check_picture(path)
-        # What a topic is called is not to be taken for a formula.
-        with matplotlib.rc_context({"text.parse_math": False, "text.usetex": False}):
-            figure = Figure(figsize=(7, 6), layout="constrained")
-            FigureCanvasAgg(figure)
-            axes = figure.add_subplot()
-            for topic, track in self.tracks.items():
-                _draw_track(axes, shown(topic, 60), sorted(track))
-            if self.tracks:
-                axes.set_aspect("equal", adjustable="datalim")
-                axes.set_xlabel("x in m")
-                axes.set_ylabel("y in m")
+
+class Curves:
+    """Numbers over time: an axis for each of the fields (`pose.pose.position.x`, `ranges[0]`), a curve each topic.
+
+    curves: by field and topic; of (received_ns, lowest, highest), since a curve of very many values is drawn as the
+    range between them.
+    """
+
+    def __init__(self, fields: Sequence[str]) -> None:
+        """ConfigError for what names no field."""
+        if wrong := [field for field in fields if not re.fullmatch(r"\w+(\[\d+\]|\.\w+)*", field)]:
+            raise ConfigError(f"{wrong[0]} names no field; write it like pose.pose.position.x or ranges[0]")
+        self._paths = {field: re.findall(r"\w+", field) for field in fields}
+        self.curves: dict[tuple[str, str], _Points[tuple[float, float, float]]] = {}
+
+    def write(self, record: ProvenRecord) -> None:
+        for field_, path in self._paths.items():
+            value: Any = record.content.data
+            for name in path:
+                if isinstance(value, list):
+                    value = value[int(name)] if name.isdigit() and int(name) < len(value) else None
+                else:
+                    value = value.get(name) if isinstance(value, dict) else None
+            key = field_, record.content.topic
+            if type(value) in (int, float, bool) and (key in self.curves or len(self.curves) < MAX_TRACKS):
+                curve = self.curves.setdefault(key, _Points(lambda a, b: (a[0], min(a[1], b[1]), max(a[2], b[2]))))
+                curve.add((record.content.received_ns, float(value), float(value)))
+
+    def draw(self, path: Path) -> int:
+        """Draw, in the format of the name's ending; how many values there are."""
+        with _figure(path, 9, 1.5 + 2.5 * len(self._paths)) as figure:
+            every = figure.subplots(len(self._paths), sharex=True, squeeze=False)[:, 0]
+            for axes, field_ in zip(every, self._paths, strict=True):
+                for (_, topic), points in (item for item in self.curves.items() if item[0][0] == field_):
+                    times = numpy.array([time for time, _, _ in points.kept for _ in range(2)], "datetime64[ns]")
+                    values = [value for _, *both in points.kept for value in both]
+                    label = f"\u200b{shown(topic, 60)}: {points.count:,} values"
+                    axes.plot(times, values, linewidth=1, label=label, marker="." if points.count == 1 else None)
+                    axes.legend(loc="best", fontsize="small")
+                axes.set_ylabel(shown(field_, 40))
                 axes.grid(alpha=0.3)
-                axes.legend(loc="best", fontsize="small")
-            else:
-                axes.set_axis_off()
-                text = "no positions in these records"
-                axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
-            figure.savefig(path, format=kind, dpi=150)
-        return sum(map(len, self.tracks.values()))
+            every[-1].set_xlabel("time of receipt, UTC")
+        return sum(points.count for points in self.curves.values())
+
+
+@contextmanager
+def _figure(path: Path, width: float, height: float) -> Iterator[Any]:
+    """An empty figure, inches, which is saved at the end. What a topic is called is not taken for a formula."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    kind = check_picture(path)
+    with matplotlib.rc_context({"text.parse_math": False, "text.usetex": False, "date.converter": "concise"}):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        figure.savefig(path, format=kind, dpi=150)
 
 
 def _position(data: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -374,12 +497,11 @@ def _is_distance(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _FARTHEST and isfinite(value)
 
 
-def _draw_track(axes: Any, label: str, track: list[tuple[int, float, float]]) -> None:
+def _draw_track(axes: Any, label: str, count: int, track: list[tuple[float, float, float]]) -> None:
     xs, ys = [x for _, x, _ in track], [y for _, _, y in track]
     seconds = (track[-1][0] - track[0][0]) / 1e9
     # A label that begins with "_" would be left out of the legend.
-    (line,) = axes.plot(xs, ys, linewidth=1.4, label=f"\u200b{label}: {len(track)} positions, {seconds:.1f} s")
-    axes.plot(xs[:1], ys[:1], marker="o", color=line.get_color(), linestyle="none")
-    axes.plot(xs[-1:], ys[-1:], marker="s", color=line.get_color(), linestyle="none")
-    axes.annotate("start", (xs[0], ys[0]), textcoords="offset points", xytext=(6, 6), fontsize="small")
-    axes.annotate("end", (xs[-1], ys[-1]), textcoords="offset points", xytext=(6, -10), fontsize="small")
+    (line,) = axes.plot(xs, ys, linewidth=1.4, label=f"\u200b{label}: {count:,} positions, {seconds:,.1f} s")
+    for at, marker, text, below in ((0, "o", "start", 6), (-1, "s", "end", -10)):
+        axes.plot(xs[at], ys[at], marker=marker, color=line.get_color(), linestyle="none")
+        axes.annotate(text, (xs[at], ys[at]), textcoords="offset points", xytext=(6, below), fontsize="small")

@@ -6,16 +6,19 @@ worth knowing, and no breach. Whatever of a log is shown goes through `shown`.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
+import numpy
 from pydantic import BaseModel, Field, StringConstraints
 
-from rosbridge_eth.chunk import MAX_TIME_MS, Log
+from rosbridge_eth.capture import TypeLine
+from rosbridge_eth.chunk import Log
 from rosbridge_eth.config.values import duration_text, time_text
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.files import write_atomically
@@ -46,8 +49,16 @@ class Kind(Enum):
     NO_GRANT = "no-grant", False, "record", "not for this reader"
     CLOCK = "clock", False, "time", "the robot's clock was not right"
 
-    def __init__(self, label: str, violation: bool, unit: str, meaning: str) -> None:
-        self.label, self.violation, self.unit, self.meaning = label, violation, unit, meaning
+    label: str
+    violation: bool
+    unit: str
+    meaning: str
+
+    def __new__(cls, label: str, violation: bool, unit: str, meaning: str) -> Kind:
+        kind = object.__new__(cls)
+        kind._value_ = kind.label = label
+        kind.violation, kind.unit, kind.meaning = violation, unit, meaning
+        return kind
 
     def counted(self, count: int) -> str:
         return f"{count:,} {self.unit}{'' if count == 1 else 's'}"
@@ -73,10 +84,10 @@ class Finding:
 class Findings:
     """Collects findings in bounded memory: neighbours with one kind and detail are one, and so are equal notices."""
 
-    def __init__(self, before: Mapping[str, int]) -> None:
-        self.counts: Counter[str] = Counter(before)
-        self.kept: list[Finding] = []
-        self._latest: dict[tuple[Kind, str], Finding] = {}
+    def __init__(self, counts: Mapping[str, int], kept: Iterable[Finding]) -> None:
+        self.counts: Counter[str] = Counter(counts)
+        self.kept = [replace(one) for one in kept]
+        self._latest = {(one.kind, one.detail): one for one in self.kept}
 
     def add(self, kind: Kind, first: int, last: int | None = None, *, count: int = 1, detail: str = "") -> None:
         last = first if last is None else last
@@ -93,36 +104,62 @@ class Findings:
         return not any(self.counts[kind.label] for kind in Kind if kind.violation)
 
 
-Hash = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-
-
 class Head(NamedTuple):
     """The robot's newest chunk as the reading has it: what the next one has to follow."""
 
-    stream: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{32}$")]
+    stream: str
     number: int
-    digest: Hash
-    sealed_ms: Annotated[int, Field(ge=0, lt=MAX_TIME_MS)]
+    digest: str
+    sealed_ms: int
     goodbye: bool
+
+
+class Links:
+    """Of the robot's chunks that were read: the first 8 bytes of each digest, and its index."""
+
+    def __init__(self) -> None:
+        self.digests, self.indices = array("Q"), array("Q")
+
+    def add(self, digest: bytes, index: int) -> None:
+        self.digests.append(int.from_bytes(digest[:8], "big"))
+        self.indices.append(index)
+
+    def index_of(self, digest: bytes) -> int | None:
+        """Where a chunk with a header of this digest was read."""
+        if not self.digests:
+            return None
+        known = numpy.frombuffer(self.digests, numpy.uint64)
+        found = numpy.flatnonzero(known == int.from_bytes(digest[:8], "big"))
+        return self.indices[int(found[0])] if len(found) else None
+
+
+@dataclass(slots=True)
+class Progress:
+    """Where a reading stands in a log, with all that it needs to go on from there and to end as one that read all.
+
+    count: chunks read. digest: hex of the last one's identity; tail: of its keccak256. found: counts of the findings.
+    """
+
+    count: int = 0
+    digest: str = ""
+    tail: str = ""
+    head: Head | None = None
+    records: int = 0
+    types: dict[str, TypeLine] = field(default_factory=dict)
+    found: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
 
 
 @dataclass(slots=True)
 class Bookmark:
-    """How far a reading has come; kept, so that the reader cannot be shown another log nor has to read all again.
+    """How far a reading has come; kept, so that the reader cannot be shown another log, unseen.
 
-    count: chunks read. digest: hex of the last one's identity. block: of it, which a reorganisation may change.
-    fingerprints: certificates that were accepted. head, records, found, types: with what a reading goes on after
-    `count`; types are the lines of the definitions, by type name.
+    count: chunks read. digest: hex of the last one's identity. fingerprints: certificates that were accepted.
     """
 
     count: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
-    block: int = 0
     fingerprints: tuple[str, ...] = ()
-    head: Head | None = None
-    records: int = 0
-    found: dict[str, int] = field(default_factory=dict)
-    types: dict[str, str] = field(default_factory=dict)
 
 
 class _File(BaseModel, strict=True, extra="forbid"):
@@ -224,7 +261,7 @@ class Verdict:
             yield "  no chunk of this robot is written"
         else:
             yield (
-                f"  the last one is number {head.number} of stream {head.stream[:8]}, which the robot sealed at"
+                f"  the last one is number {head.number} of stream {head.stream}, which the robot sealed at"
                 f" {time_text(head.sealed_ms * 10**6)} by its clock"
             )
             if head.goodbye:

@@ -8,14 +8,12 @@ messages, and the findings, of which so many are kept. docs/reading.md has the o
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numpy
 from eth_utils.crypto import keccak
 
 from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TypeLine, parse_line
@@ -34,7 +32,7 @@ from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import IdentityError, VerificationError
 from rosbridge_eth.identity import Role, Trust, split_certificates
 from rosbridge_eth.identity import verify as verify_signature
-from rosbridge_eth.reading.verdict import Bookmark, Findings, Governing, Head, Kind, Verdict, shown
+from rosbridge_eth.reading.verdict import Bookmark, Findings, Governing, Head, Kind, Links, Progress, Verdict, shown
 from smcrypto import CertificateError, InvalidKey, InvalidSignature, sm2, sm3, x509
 
 if TYPE_CHECKING:
@@ -75,6 +73,40 @@ class ProvenRecord(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class Choice:
+    """Which records are wanted: a topic, and times (nanoseconds since 1970, by the robot's receive time)."""
+
+    topic: str | None = None
+    from_ns: int | None = None
+    to_ns: int | None = None
+    at_ns: int | None = None
+
+    def choose(self, records: Iterable[ProvenRecord]) -> Iterator[ProvenRecord]:
+        """The chosen ones as they come; with `at_ns` the last one of each topic up to then, when all have come."""
+        last: dict[str, ProvenRecord] = {}
+        for record in records:
+            time = record.content.received_ns
+            if self.wants(record.content.topic, time, time):
+                if self.at_ns is None:
+                    yield record
+                else:
+                    last[record.content.topic] = record
+        yield from last.values()
+
+    def wants(self, topic: str, first: int, last: int) -> bool:
+        """Whether something of this topic that was received in these nanoseconds, both included, may be wanted."""
+        return (
+            (self.topic is None or topic == self.topic)
+            and (self.from_ns is None or last >= self.from_ns)
+            and (self.to_ns is None or first < self.to_ns)
+            and (self.at_ns is None or first <= self.at_ns)
+        )
+
+
+EVERYTHING: Final = Choice()
+
+
+@dataclass(frozen=True, slots=True)
 class ProvenChunk:
     """A chunk that is the robot's and was opened. key: opens this one alone; with `lines` it proves single records."""
 
@@ -90,7 +122,7 @@ class Verifier:
 
     standing: of the robot, at the block up to which is read. registrations: all of them, oldest first.
     reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
-    resume: go on behind the mark; then `read` needs the events from the one on that has the mark's last chunk.
+    at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
     now, heartbeat: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
     may have chunks of this robot.
     """
@@ -108,7 +140,8 @@ class Verifier:
         block_time: Callable[[int], int],
         now: float,
         mark: Bookmark | None = None,
-        resume: bool = False,
+        at: Progress | None = None,
+        links: Links | None = None,
         heartbeat: float = HEARTBEAT,
         elsewhere: Sequence[bytes] = (),
     ) -> None:
@@ -116,14 +149,11 @@ class Verifier:
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
-        self._at = deepcopy(mark) if resume and mark is not None else Bookmark()
-        self.findings = Findings(self._at.found)
-        self._types = {name: _type_line(line) for name, line in self._at.types.items()}
-        self._digests, self._indices = array("Q"), array("Q")  # of the robot's chunks: first 8 bytes, and where
-        self._broken = False
-        if self._at.head is not None:
-            self._remember(self._at.count - 1, bytes.fromhex(self._at.head.digest))
-        self._marked = mark is None or mark.count == 0  # whether the mark's chunk was compared
+        self._at, self.links = deepcopy(at or Progress()), links or Links()
+        self.findings = Findings(self._at.found, self._at.findings)
+        self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
+        self._last = b""  # the newest chunk, as it came
+        self._marked = mark is None or mark.count <= self._at.count  # whether the mark's chunk was compared
         self._timed = -1, 0  # the latest block and its time
         self._signers = [self._signer(event) for event in registrations]
         self._current = -1  # the one of them that governs the next chunk
@@ -185,33 +215,36 @@ class Verifier:
 
     def read(self, events: Iterable[DataEvent]) -> Iterator[ProvenChunk]:
         """What is proven, in the order of the log. events: oldest first."""
-        end, last = self._standing.chunks, b""
+        end, mark = self._standing.chunks, self._mark
         for event in events:
             if event.first > self._at.count:
                 self._withhold(min(event.first, end))
             for index, encoded in enumerate(event.chunks, event.first):
                 if index >= end:
-                    return  # came after the block that is looked at
-                if self._mark is not None and index == self._mark.count - 1:
-                    self._marked = True
-                    if _identity(encoded) != self._mark.digest:
-                        self.findings.add(Kind.ROLLED_BACK, index, detail="another chunk than then")
+                    break  # came after the block that is looked at
                 if index < self._at.count:
                     continue
-                self._at.count, self._at.block, last = index + 1, event.block, encoded
+                self._at.count, self._last = index + 1, encoded
                 proven = self._chunk(index, encoded, event)
+                if mark is not None and self._at.count == mark.count:
+                    self._marked = True
+                    if self._at.digest != mark.digest:
+                        self.findings.add(Kind.ROLLED_BACK, index, detail="another chunk than then")
                 if proven is not None:
                     yield proven
-                if self._at.count == end and keccak(last) != self._standing.tail:
-                    self.findings.add(Kind.ALTERED, index, detail="the contract has another hash of its last chunk")
+        if end and self._at.count == end and self._tail() != self._standing.tail.hex():
+            self.findings.add(Kind.ALTERED, end - 1, detail="the contract has another hash of its last chunk")
         self._withhold(end)
-        if not self._marked and self._mark is not None and self._mark.count <= end:
-            self.findings.add(Kind.WITHHELD, self._mark.count - 1, detail="the last chunk of the reading before")
+        if not self._marked and mark is not None and mark.count <= end:
+            self.findings.add(Kind.WITHHELD, mark.count - 1, detail="the last chunk of the reading before")
+
+    def _tail(self) -> str:
+        return keccak(self._last).hex() if self._last else self._at.tail
 
     def _withhold(self, until: int) -> None:
         if until > self._at.count:
             self.findings.add(Kind.WITHHELD, self._at.count, until - 1, count=until - self._at.count)
-            self._at.count = until
+            self._at.count, self._last, self._at.tail = until, b"", ""
 
     def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk | None:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
@@ -252,17 +285,6 @@ class Verifier:
 
     # --- links
 
-    def _remember(self, index: int, digest: bytes) -> None:
-        self._digests.append(int.from_bytes(digest[:8], "big"))
-        self._indices.append(index)
-
-    def _index_of(self, digest: bytes) -> int | None:
-        """Where a header of this digest was read."""
-        if not self._digests:
-            return None
-        found = numpy.flatnonzero(numpy.frombuffer(self._digests, numpy.uint64) == int.from_bytes(digest[:8], "big"))
-        return self._indices[int(found[0])] if len(found) else None
-
     def _follow(self, index: int, header: Header) -> bool:
         """Tell where the chunk does not follow the newest one; False for one that was read already."""
         head = self._at.head
@@ -273,7 +295,7 @@ class Verifier:
         breaks = ahead != 0 or not (follows or knows_none)
         self._broken = self._broken or breaks
         # In an unbroken log nothing can be there twice; after a break, what follows may have been read before it.
-        known = self._index_of(header.digest) if self._broken else None
+        known = self.links.index_of(header.digest) if self._broken else None
         if known is not None:
             self.findings.add(Kind.FORKED, index, detail=f"the chunk of index {known} once more")
             return False
@@ -282,13 +304,13 @@ class Verifier:
         if head is not None and not same_stream and (knows_none or not head.goodbye):
             detail = "it knows of nothing before: what it held is lost" if knows_none else ""
             self.findings.add(Kind.RESTARTED, index, detail=detail)
-        self._remember(index, header.digest)
+        self.links.add(header.digest, index)
         return True
 
     def _tell_break(self, index: int, header: Header, ahead: int, same_stream: bool) -> None:
         """Forked where the robot wrote something else at this place or after what it follows; else missing."""
         where = f"number {header.number} of stream {header.stream.hex()[:8]}"
-        followed = None if header.previous == NO_DIGEST else self._index_of(header.previous)
+        followed = None if header.previous == NO_DIGEST else self.links.index_of(header.previous)
         if followed is not None:
             self.findings.add(Kind.FORKED, index, detail=f"{where} follows the chunk of index {followed}")
         elif same_stream and ahead <= 0:
@@ -338,11 +360,10 @@ class Verifier:
             match content:
                 case MessageLine():
                     unsynchronised += not content.clock
-                    yield ProvenRecord(place, number, line, content, self._types.get(content.type_name))
+                    yield ProvenRecord(place, number, line, content, self._at.types.get(content.type_name))
                 case TypeLine():
-                    if len(self._types) < MAX_TYPES or content.type_name in self._types:
-                        self._types[content.type_name] = content
-                        self._at.types[content.type_name] = line.decode()
+                    if len(self._at.types) < MAX_TYPES or content.type_name in self._at.types:
+                        self._at.types[content.type_name] = content
                 case LostLine():
                     detail = f"{shown(content.topic)}: {shown(content.why)}"
                     self.findings.add(Kind.LOST, place.chunk, count=content.lost, detail=detail)
@@ -372,18 +393,28 @@ class Verifier:
             nodes=tuple(nodes),
         )
 
+    @property
+    def honest(self) -> bool:
+        """Whether the node kept nothing back, and showed again what it showed before."""
+        counts = self.findings.counts
+        return not counts[Kind.WITHHELD.label] and not counts[Kind.ROLLED_BACK.label]
+
+    def progress(self) -> Progress:
+        """Where the reading stands, between two chunks. New certificates are not in it: they are told anew."""
+        kept = [one for one in self.findings.kept if one.kind is not Kind.NEW_CERTIFICATE]
+        found = {label: count for label, count in self.findings.counts.items() if label != Kind.NEW_CERTIFICATE.label}
+        return deepcopy(replace(self._at, tail=self._tail(), found=found, findings=kept))
+
     def bookmark(self, *, confirm: bool = False) -> Bookmark | None:
         """What to keep after `read` has ended; the old mark where the node kept something back or rolled back.
 
         confirm: the reader has compared the fingerprints; new certificates are known from now on.
         """
-        counts = self.findings.counts
-        if counts[Kind.WITHHELD.label] or counts[Kind.ROLLED_BACK.label]:
+        if not self.honest:
             return self._mark
         now = [signer.fingerprint for signer in self._signers if not signer.revoked]
         known = now if confirm or self._mark is None else self._mark.fingerprints
-        found = {label: count for label, count in counts.items() if label != Kind.NEW_CERTIFICATE.label}
-        return replace(deepcopy(self._at), fingerprints=tuple(dict.fromkeys(known)), found=found)
+        return Bookmark(self._at.count, self._at.digest, tuple(dict.fromkeys(known)))
 
 
 def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
@@ -394,18 +425,3 @@ def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
     except InvalidSignature:
         return False
     return True
-
-
-def _identity(encoded: bytes) -> str:
-    """The digest of a chunk's header; of what is no chunk, of all its bytes."""
-    try:
-        return Chunk.parse(encoded).header.digest.hex()
-    except Malformed:
-        return sm3.digest(encoded).hex()
-
-
-def _type_line(line: str) -> TypeLine:
-    content = parse_line(line.encode())
-    if not isinstance(content, TypeLine):
-        raise VerificationError("a bookmark has a definition that is none")
-    return content

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,31 +107,6 @@ def test_a_record_that_is_replayed_on_a_second_contract_is_refused(chain, tmp_pa
         reading = chain.read(ledgers=[second], bookmarks=known)
         assert numbers(reading) == []
         assert violations(reading) == [kind.label]
-
-
-def test_the_second_reading_asks_only_for_what_is_new(chain, tmp_path, monkeypatch):
-    monkeypatch.setattr("rosbridge_eth.reading.fetch.MARGIN", 0)
-    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
-    for _ in range(4):
-        chain.write(chain.pen.chunks(3))
-    first = chain.read(bookmarks=bookmarks, resume=True)
-    assert len(numbers(first)) == 12
-    first.keep(bookmarks)
-    chain.write(chain.pen.chunks(2))
-    asked: list[tuple[int, int]] = []
-    real = Ledger.data_events
-
-    def data_events(self: Ledger, tk: bytes, first_block: int, last_block: int) -> Iterator[Any]:
-        asked.append((first_block, last_block))
-        return real(self, tk, first_block, last_block)
-
-    monkeypatch.setattr(Ledger, "data_events", data_events)
-    second = chain.read(bookmarks=bookmarks, resume=True)
-    assert numbers(second) == [12, 13]
-    assert second.verdict().sound
-    assert second.verdict().records == 14
-    [(first_block, last_block)] = asked
-    assert last_block - first_block == 1
 
 
 def test_confirmations_leave_the_newest_blocks_for_later(chain):

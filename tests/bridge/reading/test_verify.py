@@ -629,7 +629,7 @@ def test_findings_are_counted_beyond_those_that_are_kept():
 def test_definitions_are_bounded():
     rest = {"wire": "ros1", "format": "msg", "definition": "int8 x\n"}
     lines = [line({"type": f"a/msg/T{n}"} | rest) for n in range(300)]
-    assert len(read([Pen().write(*lines, message(1))]).mark.types) == 256
+    assert len(read([Pen().write(*lines, message(1))]).verifier.progress().types) == 256
 
 
 # --- terminals

@@ -10,11 +10,12 @@ from functools import cache
 from typing import Any
 
 from eth_utils.crypto import keccak
+from pydantic import TypeAdapter
 
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id, seal
 from rosbridge_eth.identity import CertificateAuthority, Identity, Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.reading.verdict import Bookmark, Finding, Kind, Verdict
+from rosbridge_eth.reading.verdict import Bookmark, Finding, Kind, Links, Progress, Verdict
 from rosbridge_eth.reading.verify import NO_DIGEST, ProvenChunk, Verifier
 
 NAME, LEDGER = "robot_1", b"L" * 32
@@ -144,6 +145,15 @@ class Read:
         mark = self.verifier.bookmark()
         assert mark is not None
         return mark
+
+    @property
+    def at(self) -> dict[str, Any]:
+        """Where the next reading goes on."""
+        links = Links()
+        for digest, index in zip(self.verifier.links.digests, self.verifier.links.indices, strict=True):
+            links.add(digest.to_bytes(8, "big"), index)
+        progress = TypeAdapter(Progress)
+        return {"at": progress.validate_json(progress.dump_json(self.verifier.progress())), "links": links}
 
     def only(self, kind: Kind) -> Finding:
         assert [one.kind for one in self.verdict.findings] == [kind], list(self.verdict.lines())
