@@ -56,8 +56,7 @@ def network(kind: str, clients: int, period: int, dag: Path | None = None) -> It
                     node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")
                 yield [node.url]
             return
-        others = [geth_network.new_key().public_key.to_checksum_address() for _ in range(9)]
-        balances = dict.fromkeys([KEYS.operator.address, *others], 100 * ETH)
+        balances = geth_network.ten_accounts(KEYS.operator.address)
         with geth_network.Network(Path(folder), balances, period=period, gas_limit=0xFFFFFFFF, dag=dag) as running:
             running.await_blocks(3)
             yield [node.url for node in running.nodes]

@@ -71,6 +71,11 @@ def new_key() -> PrivateKey:
     return PrivateKey(os.urandom(32))
 
 
+def ten_accounts(operator: str) -> dict[str, int]:
+    """The paper's: 100 ETH for each of ten, one of which is the operator's."""
+    return dict.fromkeys([operator, *(new_key().public_key.to_checksum_address() for _ in range(9))], 100 * 10**18)
+
+
 def genesis(signers: list[str], balances: Mapping[str, int], period: int, gas_limit: int) -> dict[str, Any]:
     """The first block of a network with London's rules, where these may sign, one block every `period` seconds.
 

@@ -47,7 +47,6 @@ from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.supervisor import open_store, open_submitter
 
-ETH = 10**18
 PER_BUCKET = 100  # messages that share a point of the picture
 CONFIRMATIONS = {"poa": 3, "pow": 12}
 DEPTH = 6  # blocks that the reorganisation takes back, at least
@@ -171,7 +170,7 @@ def _network(dag: Path | None, nodes: int, miners: int) -> Iterator[tuple[list[s
     """A network where a new operator has 100 ETH, and its nodes' URLs."""
     keys = Keyring.create()
     with tempfile.TemporaryDirectory(prefix="network-") as folder, geth_network.Network(
-        Path(folder), {keys.operator.address: 100 * ETH}, nodes=nodes, miners=miners, dag=dag
+        Path(folder), geth_network.ten_accounts(keys.operator.address), nodes=nodes, miners=miners, dag=dag
     ) as network:  # fmt: skip
         network.await_blocks(2)
         yield [node.url for node in network.nodes], keys
@@ -185,7 +184,7 @@ def reorganisation(dag: Path) -> Part:
     """
     keys = Keyring.create()
     with tempfile.TemporaryDirectory() as folder, geth_network.Network(
-        Path(folder) / "network", {keys.operator.address: 100 * ETH}, nodes=2, miners=2, dag=dag
+        Path(folder) / "network", geth_network.ten_accounts(keys.operator.address), nodes=2, miners=2, dag=dag
     ) as network:  # fmt: skip
         ours, other = network.nodes
         network.await_blocks(2)
