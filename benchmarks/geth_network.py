@@ -198,6 +198,7 @@ class Network:
             for number, (key, role) in enumerate(zip(keys, roles, strict=True))
         ]
         period = period if dag is None else 0
+        self._patience = PATIENCE if dag is None else 15 * PATIENCE  # a block comes when it comes
         first_block = genesis([node.signer for node in self.nodes], balances, period, gas_limit)
         try:
             for node in self.nodes:
@@ -246,8 +247,8 @@ class Network:
         self._await(f"{count} more blocks", lambda: node.height() >= aim)
 
     def _await(self, what: str, holds: Any) -> None:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + self._patience
         while not holds():
             if time.monotonic() > deadline:
-                raise RuntimeError(f"{what}: not within {PATIENCE:.0f} s")
+                raise RuntimeError(f"{what}: not within {self._patience:.0f} s")
             time.sleep(0.05)
