@@ -98,6 +98,17 @@ def _pkcs12(data: bytes) -> None:
     pkcs12.load(data, b"password")
 
 
+def _pkcs12_inside(data: bytes) -> None:
+    """What stands behind the MAC, which no change by chance would pass."""
+    password, salt = "password".encode("utf-16-be") + b"\0\0", b"salt"
+    name = "1.2.156.10197.1.401"
+    tag = pkcs12._mac(name, password, salt, 1, data)
+    algorithm = der.sequence(der.oid(name))
+    mac = der.sequence(der.sequence(algorithm, der.octet_string(tag)), der.octet_string(salt))
+    content = der.sequence(der.oid("1.2.840.113549.1.7.1"), der.explicit(0, der.octet_string(data)))
+    pkcs12.load(der.sequence(der.integer(3), content, mac), b"password")
+
+
 def _enveloped_key(data: bytes) -> None:
     key = sm2.PrivateKey.from_enveloped(data, _KEY)
     _require(sm2.PrivateKey.from_enveloped(key.to_enveloped(_KEY.public_key), _KEY) == key, "enveloped key")
@@ -109,7 +120,7 @@ def _diagnose(data: bytes) -> None:
 
 READERS: tuple[Callable[[bytes], None], ...] = (
     _der, _pem, _private_key, _public_key, _name, _certificate, _request, _crl, _cms, _pkcs12,
-    _enveloped_key, _diagnose,
+    _pkcs12_inside, _enveloped_key, _diagnose,
 )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ _SPEC.loader.exec_module(parsers)
 
 ROOT = root(extended_key_usage=("serverAuth",), subject_alt_names=("DNS:a", "URI:urn:b", "IP:::1", "dirName:CN=c"))
 KEY = sm2.PrivateKey.generate()
+P12 = pkcs12.dump([pkcs12.Entry(KEY)], b"password", others=[ROOT.certificate], iterations=2)
 FILES = [
     KEY.to_der(),
     KEY.to_der(format="sec1"),
@@ -32,7 +33,8 @@ FILES = [
     ROOT.crl(x509.RevokedCertificate(7, NOW, "superseded")).to_der(),
     cms.sign(b"m", parsers._KEY, parsers._CERTIFICATE, signing_time=NOW),
     cms.encrypt(b"m", [parsers._CERTIFICATE]),
-    pkcs12.dump([pkcs12.Entry(KEY)], b"password", iterations=2),
+    P12,
+    pkcs12._authenticated(P12, b"password"),
     KEY.to_enveloped(parsers._KEY.public_key),
 ]
 
