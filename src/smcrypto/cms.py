@@ -84,7 +84,8 @@ def sign(
     """SignedData in DER, with `certificate` and `certificates` (its issuers) inside.
 
     detached: without the content, which travels beside it. signing_time: aware; adds the authenticated attributes.
-    InvalidKey: `key` is not the key of `certificate`. InvalidOption: a naive time. Source: GM/T 0010, 8.
+    InvalidKey: `key` is not the key of `certificate`. InvalidOption: a naive time; or, without signing_time, a content
+    that has the form of authenticated attributes, which `verify` refuses. Source: GM/T 0010, 8.
     """
     data, signer = as_bytes(content, "content"), _signer_info(content, key, certificate, signing_time, uid)
     inner = () if detached else (der.explicit(0, der.octet_string(data)),)
@@ -170,7 +171,7 @@ def _verified(body: der.Reader, content: bytes, trust: _Trust) -> Signed:
     if not signers:
         raise InvalidSignature("nobody signed the message")
     if trust.roots is not None:
-        for certificate in signers:
+        for certificate in dict.fromkeys(signers):
             verify_chain(
                 certificate, intermediates=known, roots=trust.roots, at=trust.at, crls=[*trust.crls, *lists],
             )  # fmt: skip
@@ -188,6 +189,8 @@ def _verify_signer(
     if info.has_explicit(0):
         attributes = info.implicit_set_of(0)
         signed, time = _read_attributes(attributes, content)
+    elif _are_attributes(content):
+        raise InvalidSignature("what was signed are the attributes of another message")
     _require_algorithm(info, _SIGNATURES, "signature")
     signature = info.octet_string()
     if info.has_explicit(1):
@@ -200,6 +203,26 @@ def _verify_signer(
         raise CertificateError(f"{certificate.subject} may not sign: its certificate is for {', '.join(sorted(usage))}")
     certificate.public_key.verify(signature, signed, uid=uid)
     return certificate, time
+
+
+def _are_attributes(content: bytes) -> bool:
+    """Is `content` what another message's signature covers, its attributes?
+
+    Without this, whoever has a message with attributes could make one without them, and with their DER as its content.
+    """
+    try:
+        outer = der.Reader(content)
+        attributes = outer.set_of()
+        outer.finish()
+        kinds: set[str] = set()
+        while not attributes.at_end():
+            attribute = attributes.sequence()
+            kinds.add(attribute.oid())
+            attribute.set_of()
+            attribute.finish()
+    except InvalidEncoding:
+        return False
+    return _MESSAGE_DIGEST in kinds
 
 
 def _read_attributes(attributes: der.Reader, content: bytes) -> tuple[bytes, datetime | None]:
@@ -238,6 +261,8 @@ def _signer_info(
         raise InvalidKey("key is not the key of certificate")
     attributes: list[bytes] = []
     signed = data
+    if time is None and _are_attributes(data):
+        raise InvalidOption("the content has the form of authenticated attributes: sign it with a signing_time")
     if time is not None:
         attributes = sorted(
             der.sequence(der.oid(kind), der.set_of(value))
@@ -281,7 +306,10 @@ def decrypt(data: BytesLike, key: sm2.PrivateKey, certificate: Certificate) -> b
     sealed_key = _own_key(body, key, certificate)
     ciphertext, iv = _encrypted_content(body)
     body.finish()
-    return _decrypted(sealed_key, ciphertext, iv, key)
+    try:
+        return sm4.decrypt(_content_key(sealed_key, key), sm4.CBC(iv), ciphertext, padding="pkcs7")
+    except (InvalidCiphertext, InvalidPadding):  # what differs would be an oracle (Bleichenbacher, Vaudenay)
+        raise InvalidCiphertext(_NOT_FOR_US) from None
 
 
 def sign_and_encrypt(
@@ -321,12 +349,19 @@ def decrypt_and_verify(
     crls: Iterable[CertificateRevocationList] = (),
     uid: BytesLike = sm2.DEFAULT_UID,
 ) -> Signed:
-    """The content of SignedAndEnvelopedData and its signers; arguments and errors as of `decrypt` and `verify`."""
+    """The content of SignedAndEnvelopedData and its signers; arguments and errors as of `decrypt` and `verify`.
+
+    InvalidCiphertext: the content key does not open. A content that was changed is InvalidSignature.
+    """
     body = _opened(as_bytes(data, "data"), _SIGNED_AND_ENVELOPED)
     sealed_key = _own_key(body, key, certificate)
     _require_digests(body)
     ciphertext, iv = _encrypted_content(body)
-    content = _decrypted(sealed_key, ciphertext, iv, key)
+    try:
+        content = sm4.decrypt(_content_key(sealed_key, key), sm4.CBC(iv), ciphertext, padding="pkcs7")
+    except InvalidPadding:
+        # Nobody signed this. To tell bad padding from a bad signature would give the content away (Vaudenay, 2002).
+        content = secrets.token_bytes(32)
     return _verified(body, content, _Trust.of(roots, at, intermediates, crls, uid))
 
 
@@ -392,12 +427,11 @@ def _encrypted_content(body: der.Reader) -> tuple[bytes, bytes]:
     return ciphertext, iv
 
 
-def _decrypted(sealed_key: bytes, ciphertext: bytes, iv: bytes, key: sm2.PrivateKey) -> bytes:
-    """One failure for the key and the padding: what differs would be an oracle (Bleichenbacher, Vaudenay)."""
-    try:
-        return sm4.decrypt(key.decrypt(sealed_key), sm4.CBC(iv), ciphertext, padding="pkcs7")
-    except (InvalidCiphertext, InvalidKey, InvalidPadding):
-        raise InvalidCiphertext(_NOT_FOR_US) from None
+def _content_key(sealed: bytes, key: sm2.PrivateKey) -> bytes:
+    content_key = key.decrypt(sealed)
+    if len(content_key) != 16:
+        raise InvalidCiphertext(_NOT_FOR_US)
+    return content_key
 
 
 # --- what all have in common ---
@@ -409,7 +443,8 @@ def _message(kind: str, *parts: bytes) -> bytes:
 
 def _opened(data: bytes, kind: str) -> der.Reader:
     """The body of a ContentInfo of this kind, its version read."""
-    info = der.only_sequence(pem.first(data, _LABELS).der if b"-----BEGIN " in data else data)
+    # DER first: a message may well have PEM in its content.
+    info = der.only_sequence(data if data[:1] == b"\x30" else pem.first(data, _LABELS).der)
     name = info.oid()
     if _KINDS.get(name) != kind:
         raise InvalidEncoding(f"the message is of the kind {name}, not {kind}")

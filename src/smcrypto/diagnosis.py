@@ -98,15 +98,16 @@ def diagnose(
 
     data: text (hex, base64, PEM) or bytes (the same, DER, or raw), at most 1 MiB, otherwise InvalidLength.
     key: whose it should be; a private key also opens ciphertexts. message: what a signature should be of. uid: a
-    distinguishing identifier to try beside the usual ones. password: of an encrypted key. Decrypted texts and
-    private keys are not shown. It raises nothing else: what fits nothing has no readings.
+    distinguishing identifier to try beside the usual ones, at most 8,191 bytes, otherwise InvalidLength. password: of
+    an encrypted key. Decrypted texts and private keys are not shown. It raises nothing else: what fits nothing has no
+    readings.
 
     >>> key = sm2.PrivateKey.generate()
     >>> signature = key.sign(b"message", encoding="raw").hex()
     >>> print(diagnose(signature, key=key, message=b"message").readings[0].verdict)
     holds for the key, with uid b'1234567812345678'
     """
-    octets = data.encode("utf-8") if isinstance(data, str) else as_bytes(data, "data")
+    octets = data.encode("utf-8", "replace") if isinstance(data, str) else as_bytes(data, "data")
     if len(octets) > MAX_SIZE:
         raise InvalidLength(f"what is to be diagnosed is at most {MAX_SIZE} bytes, not {len(octets)}")
     if not (key is None or isinstance(key, sm2.PrivateKey | sm2.PublicKey)):

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from smcrypto import der, sm2, sm3
 from smcrypto.errors import InvalidEncoding, InvalidKey, InvalidOption, InvalidPadding
-from smcrypto.inputs import BytesLike, as_bytes, require_type
+from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.sm2.keyfiles import ITERATIONS, MAX_PURE_ITERATIONS, Prf, read_pbes2, write_pbes2
 from smcrypto.x509 import Certificate
 
@@ -83,7 +83,7 @@ def dump(
     secret, listed, chain = as_bytes(password, "password"), tuple(entries), tuple(others)
     if not listed:
         raise InvalidOption("there is no key to write")
-    if not 1 <= iterations <= MAX_PURE_ITERATIONS:
+    if not 1 <= require_int(iterations, "iterations") <= MAX_PURE_ITERATIONS:
         raise InvalidOption(f"iterations must be between 1 and {MAX_PURE_ITERATIONS}, not {iterations}")
     try:
         wide = _bmp(secret)
@@ -96,7 +96,7 @@ def dump(
         require_type(entry.key, sm2.PrivateKey, "the key of an entry")
         attributes = [_attribute(_LOCAL_KEY_ID, der.octet_string(number.to_bytes(4, "big")))]
         if entry.name is not None:
-            attributes.append(_attribute(_FRIENDLY_NAME, der.element(der.BMP_STRING, entry.name.encode("utf-16-be"))))
+            attributes.append(_attribute(_FRIENDLY_NAME, der.element(der.BMP_STRING, _name(entry.name))))
         algorithm, ciphertext = write_pbes2(entry.key.to_der(), secret, prf, iterations)
         sealed = der.sequence(algorithm, der.octet_string(ciphertext))
         key_bags.append(_bag(_SHROUDED_KEY_BAG, sealed, attributes))
@@ -309,6 +309,14 @@ def _content(kind: str, value: bytes) -> bytes:
 
 def _attribute(kind: str, value: bytes) -> bytes:
     return der.sequence(der.oid(kind), der.set_of(value))
+
+
+def _name(text: str) -> bytes:
+    require_type(text, str, "the name of an entry")
+    try:
+        return text.encode("utf-16-be")
+    except UnicodeEncodeError:
+        raise InvalidOption("the name of an entry has a character that is none (a lone surrogate)") from None
 
 
 def _bag(kind: str, value: bytes, attributes: list[bytes]) -> bytes:

@@ -100,6 +100,57 @@ def test_signed(content: bytes, detached: bool, time: datetime | None, uid: byte
             cms.verify(data, roots=None, at=NOW, content=content + b"!", uid=uid)
 
 
+def test_a_message_may_have_pem_in_its_content() -> None:
+    """Also another message: it is the outer one that is read."""
+    for inside in (CERTIFICATE.to_pem(), pem.encode("CMS", cms.sign(b"inner", OTHER, SIGNING))):
+        content = b"see\n" + inside
+        assert cms.verify(cms.sign(content, OTHER, SIGNING), **TRUST).content == content
+
+
+def without_attributes(data: bytes) -> bytes:
+    """The message whose signature `data` has: no attributes, and their DER as the content."""
+    info = der.only_sequence(data)
+    kind, body = info.raw(), info.explicit(0).sequence()
+    version, digests, _, certificates = (body.raw() for _ in range(4))
+    signer = body.set_of().sequence()
+    parts = [signer.raw() for _ in range(6)]
+    attributes = bytes([der.SET]) + parts.pop(3)[1:]
+    content = der.sequence(der.oid("1.2.156.10197.6.1.4.2.1"), der.explicit(0, der.octet_string(attributes)))
+    signers = der.set_of(der.sequence(*parts))
+    return der.sequence(kind, der.explicit(0, der.sequence(version, digests, content, certificates, signers)))
+
+
+def test_attributes_are_not_taken_for_a_content() -> None:
+    """The signature over the attributes of one message would hold over another that has their DER as its content."""
+    forged = without_attributes(cms.sign(b"pay 10", OTHER, SIGNING, signing_time=NOW))
+    with pytest.raises(InvalidSignature, match="attributes of another message"):
+        cms.verify(forged, **TRUST)
+    attributes = der.set_of(der.sequence(der.oid("1.2.840.113549.1.9.4"), der.set_of(der.octet_string(bytes(32)))))
+    with pytest.raises(InvalidOption, match="signing_time"):
+        cms.sign(attributes, OTHER, SIGNING)
+    assert cms.verify(cms.sign(attributes, OTHER, SIGNING, signing_time=NOW), **TRUST).content == attributes
+    for other in (der.set_of(), der.set_of(der.sequence(der.oid("1.2.3"), der.set_of())), attributes + b"!"):
+        assert cms.verify(cms.sign(other, OTHER, SIGNING), **TRUST).content == other
+
+
+def test_a_changed_content_is_told_in_one_way_only() -> None:
+    """Bad padding or a bad signature: the difference would be an oracle for the content (Vaudenay, 2002)."""
+    data = cms.sign_and_encrypt(b"a content of more than one block", OTHER, SIGNING, [SEALING])
+    info = der.only_sequence(data)
+    info.oid()
+    body = info.explicit(0).sequence()
+    encrypted = [body.raw() for _ in range(4)][3]
+    begin = data.index(encrypted) + len(encrypted) - 48  # the ciphertext ends it
+    reasons = set()
+    for position in range(begin, begin + 48):
+        altered = bytearray(data)
+        altered[position] ^= 1
+        with pytest.raises(InvalidSignature) as error:
+            cms.decrypt_and_verify(altered, OTHER, SEALING, **TRUST)
+        reasons.add(str(error.value))
+    assert len(reasons) == 1
+
+
 def test_a_signer_must_be_trusted() -> None:
     data = cms.sign(CONTENT, OTHER, SIGNING)
     assert cms.verify(data, **TRUST).signers == (SIGNING,)

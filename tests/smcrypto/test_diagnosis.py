@@ -257,3 +257,7 @@ def test_bytes_that_begin_as_der_does_are_keys_all_the_same() -> None:
         xy for d in range(1, 5000) if (xy := sm2.PrivateKey.from_int(d).public_key.to_bytes()[1:])[0] == 0x30
     )
     assert [reading.what for reading in diagnose(point).readings] == ["public key"]
+
+
+def test_text_that_is_no_text_is_nothing() -> None:
+    assert diagnose("\ud800").readings == ()

@@ -168,3 +168,12 @@ def test_alterations_are_refused_by_the_mac(draw: st.DataObject) -> None:
     data[position] ^= draw.draw(st.integers(1, 255))
     with pytest.raises(SMCryptoError):
         load(bytes(data), b"p")
+
+
+def test_a_name_that_cannot_be_written() -> None:
+    with pytest.raises(InvalidOption, match="surrogate"):
+        dump([Entry(KEY, name="\ud800")], PASSWORD, **FAST)
+    for entry, options in ((Entry(KEY, name=b"robot"), FAST), (Entry(KEY), {"iterations": "3"})):  # type: ignore[arg-type]
+        with pytest.raises(TypeError):
+            dump([entry], PASSWORD, **options)
+    assert load(dump([Entry(KEY, name="机器人 🤖")], PASSWORD, **FAST), PASSWORD).entries[0].name == "机器人 🤖"
