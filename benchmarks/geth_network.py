@@ -12,6 +12,7 @@ import os
 import random
 import shutil
 import socket
+import struct
 import subprocess
 import time
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from typing import Any
 import requests
 from eth_account import Account
 from eth_keys.datatypes import PrivateKey
+from eth_utils.crypto import keccak
 
 CHAIN_ID, EPOCH, GAS_LIMIT = 4711, 30_000, 30_000_000
 DIFFICULTY = 0x4CCC8  # of the paper's network by proof of work
@@ -47,9 +49,16 @@ def find_geth(consensus: str = "clique") -> str:
 
 
 def make_dag(folder: Path) -> None:
-    """The 1 GB of ethash's first epoch, without which nobody mines; made once, in minutes of a core."""
-    if not any(folder.glob("full-R23-*")):
+    """The 1 GB of ethash's first epoch, without which nobody mines; made once, in minutes of a core.
+
+    geth would make the next epoch's beside the mining, 30,000 blocks before anybody needs it, on all cores. A file that
+    begins as one does keeps it from that.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "full-R23-0000000000000000").exists():
         subprocess.run([find_geth("ethash"), "makedag", "0", str(folder)], check=True, capture_output=True)
+    next_seed = keccak(bytes(32))[:8].hex()
+    (folder / f"full-R23-{next_seed}").write_bytes(struct.pack("<II", 0xBADDCAFE, 0xFEE1DEAD).ljust(4096, b"\0"))
 
 
 def free_ports(count: int) -> list[int]:
