@@ -386,6 +386,7 @@ class _Points(Generic[_Point]):
         self.count, self.kept = 0, list[_Point]()
 
     def add(self, point: _Point) -> None:
+        self.last = point
         if self.count % self._each:
             self.kept[-1] = self._merge(self.kept[-1], point)
         else:
@@ -417,7 +418,7 @@ class Trajectory:
                 return 0
             axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="x in m", ylabel="y in m")
             for topic, points in self.tracks.items():
-                _draw_track(axes, shown(topic, 60), points.count, sorted(points.kept))
+                _draw_track(axes, shown(topic, 60), points.count, sorted({*points.kept, points.last}))
             axes.grid(alpha=0.3)
             axes.legend(loc="best", fontsize="small")
         return sum(points.count for points in self.tracks.values())

@@ -334,3 +334,111 @@ def test_an_ending_that_is_no_bag_or_table(tmp_path, check, name):
 def test_a_folder_that_is_not_there(tmp_path, check, name):
     with pytest.raises(ConfigError, match="no folder"):
         check(tmp_path / name)
+
+
+def test_a_field_is_drawn_over_time_where_it_was(tmp_path):
+    """A step from low to high leaves ink lower left and upper right, and none upper left."""
+    curves = outputs.Curves(["pose.pose.position.x", "pose.pose.position.y"])
+    for n in range(200):
+        curves.write(odometry(n * 10**9, 0.0 if n < 100 else 5.0, 1.0))
+        curves.write(point(n * 10**9))
+    assert {key: points.count for key, points in curves.curves.items()} == {
+        ("pose.pose.position.x", "/odom"): 200, ("pose.pose.position.y", "/odom"): 200}  # fmt: skip
+    assert curves.draw(tmp_path / "curves.png") == 400
+    image = imread(tmp_path / "curves.png")[:, :, :3]
+    coloured = (image.max(axis=2) - image.min(axis=2)) > 0.3
+    height, width = coloured.shape
+    upper, left, right = slice(height // 10, height // 4), slice(width // 5, width * 2 // 5), slice(width // 2, width)
+    assert coloured[height // 4 : height // 2, left].any()
+    assert coloured[: height // 4, right].any()
+    assert not coloured[upper, left].any()
+
+
+def test_elements_of_arrays_and_what_is_no_number():
+    curves = outputs.Curves(["ranges[1]", "on", "deep[0].x"])
+    for data in ({"ranges": [1, 2.5]}, {"ranges": [1]}, {"ranges": "x"}, {"ranges": {"1": 5}}, {"ranges": [1, "NaN"]},
+                 {"on": True}, {"deep": [{"x": 7}]}, {"deep": [7]}, {}):  # fmt: skip
+        curves.write(record(1, "pkg/msg/A", data))
+    assert {field: points.kept for (field, _), points in curves.curves.items()} == {
+        "ranges[1]": [(T0 + 1, 2.5, 2.5), (T0 + 1, 5.0, 5.0)], "on": [(T0 + 1, 1.0, 1.0)],
+        "deep[0].x": [(T0 + 1, 7.0, 7.0)]}  # fmt: skip
+
+
+@pytest.mark.parametrize("field", ["", "a..b", "a[x]", "a b", ".a", "$x$", "a["])
+def test_what_names_no_field(field):
+    with pytest.raises(ConfigError, match="names no field"):
+        outputs.Curves([field])
+
+
+def test_a_curve_of_very_many_values_keeps_its_peaks_in_little_memory():
+    curves = outputs.Curves(["x"])
+    peaks = {12_345, 54_321}
+    for n in range(60_000):
+        content = MessageLine("/t", "a/msg/A", "sim", T0 + n, 0, True, {"x": 9.0 if n in peaks else 0.0})
+        curves.write(ProvenRecord(PLACE, n, b"", content, None))
+    [points] = curves.curves.values()
+    assert points.count == 60_000
+    assert outputs.MAX_POINTS // 2 <= len(points.kept) <= outputs.MAX_POINTS
+    assert [time - T0 <= peak < time - T0 + 8 for time, _, high in points.kept if high == 9.0 for peak in sorted(peaks)
+            if abs(time - T0 - peak) < 8] == [True, True]  # fmt: skip
+    assert points.kept[0][0] == T0
+    assert T0 + 59_990 < points.kept[-1][0] < T0 + 60_000
+
+
+@pytest.mark.parametrize("topic", [r"$\frac{$", "_hidden", EVIL])
+def test_a_topic_of_a_curve_is_drawn_as_it_is_written(tmp_path, topic):
+    curves = outputs.Curves(["x"])
+    curves.write(point(1, topic=topic))
+    assert curves.draw(tmp_path / "curve.svg") == 1
+
+
+# --- Parquet
+
+
+def parquet(path: Path, records: Iterable[ProvenRecord]) -> Any:
+    with outputs.table(path) as table:
+        for one in records:
+            table.write(one)
+    return pytest.importorskip("pyarrow.parquet").read_table(path)
+
+
+def test_a_parquet_file_has_numbers_times_and_lists(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "_BATCH", 2)
+    more = {"header": {"stamp": T0 + 7, "frame_id": "=base"}, "joints": [1, 2.5], "ids": [1, 2], "on": True, "n": 3,
+            "f": "NaN", "big": 2**64 - 1, "mixed": [{"a": 1}], "empty": []}  # fmt: skip
+    definition = TypeLine("acme_msgs/msg/Arm", "ros1", "msg", "Header header\nint64 n\n" + "=" * 80 +
+                          "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n")  # fmt: skip
+    arms = [record(n, "acme_msgs/msg/Arm", more | {"f": 0.5} if n else more, "/arm", definition) for n in range(4)]
+    table = parquet(tmp_path / "t.parquet", [*arms, point(9)])
+    types = {field.name: str(field.type) for field in table.schema}
+    assert types | {
+        "topic": "string", "received": "timestamp[ns, tz=UTC]", "captured": "timestamp[ns, tz=UTC]", "clock": "bool",
+        "stream": "string", "number": "int64", "chunk": "int64", "block": "int64", "transaction": "string",
+        "header.stamp": "timestamp[ns, tz=UTC]", "header.frame_id": "string", "joints": "list<element: double>",
+        "ids": "list<element: int64>", "on": "bool", "n": "int64", "f": "double", "big": "string", "mixed": "string",
+        "empty": "string", "x": "double",
+    } == types  # fmt: skip
+    rows = table.drop(["received", "captured", "header.stamp"]).to_pylist()
+    assert table["received"].cast("int64").to_pylist() == [T0, T0 + 1, T0 + 2, T0 + 3, T0 + 9]
+    assert table["header.stamp"].cast("int64").to_pylist() == [T0 + 7] * 4 + [None]
+    assert (rows[1]["joints"], rows[1]["ids"], rows[1]["f"]) == ([1.0, 2.5], [1, 2], 0.5)
+    assert rows[0]["f"] != rows[0]["f"], "NaN is a number that is not one"
+    assert (rows[1]["big"], rows[1]["mixed"], rows[1]["empty"]) == (str(2**64 - 1), '[{"a": 1}]', "[]")
+    assert (rows[1]["header.frame_id"], rows[4]["n"], rows[4]["x"]) == ("=base", None, 0.5)
+
+
+def test_columns_that_hold_this_and_that_are_text(tmp_path):
+    rows = [{"a": 1, "b": 1, "c": "NaN", "d": [1], "e": None}, {"a": "x", "b": 2.5, "c": "y", "d": 7, "e": {}}]
+    table = parquet(tmp_path / "t.parquet", [record(n, "pkg/msg/A", row) for n, row in enumerate(rows)])
+    assert {name: table[name].to_pylist() for name in "abcd"} == {
+        "a": ["1", '"x"'], "b": [1.0, 2.5], "c": ["NaN", "y"], "d": ["[1]", "7"]}  # fmt: skip
+
+
+def test_a_parquet_file_of_nothing_has_its_columns(tmp_path):
+    assert parquet(tmp_path / "t.parquet", []).num_rows == 0
+
+
+def test_without_pyarrow_parquet_is_refused_before_anything_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pysmcrypto\[parquet\]"):
+        outputs.check_table(tmp_path / "t.parquet")

@@ -1,0 +1,163 @@
+"""One's own recording against what came back: bags that rosbags writes, records that capture makes."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy
+import pytest
+from rosbags.rosbag1 import Writer
+
+from rosbridge_eth.capture import Capture, MessageLine, RawMessage, TopicRule, Wire, decoder_for, parse_line
+from rosbridge_eth.reading.compare import MAX_DIFFERENCES, Comparison, compare, time_of
+
+T0, STEP = 1_763_690_000_000_000_000, 100_000_000
+DEFINITION = "int64 n\nfloat32 f\nuint8[] raw\nstring[] names\ntime at\nbool from\nbyte b\n"
+DECODER = decoder_for(Wire.ROS1, "acme_msgs/msg/Thing", DEFINITION)
+
+
+def thing(n: int, f: float = 0.5, text: str = "b") -> bytes:
+    types = DECODER.typestore.types
+    at = types["builtin_interfaces/msg/Time"](5, n)
+    raw = numpy.array([n % 256, 2], "u1")
+    return DECODER.encode(types[DECODER.type_name](n, f, raw, ["a", text], at, True, -3))
+
+
+def messages(count: int, topic: str = "/t", same: bool = False) -> list[RawMessage]:
+    return [
+        RawMessage(topic, DECODER.type_name, T0 + n * STEP, thing(0 if same else n), DECODER) for n in range(count)
+    ]
+
+
+def bag(path: Path, written: Sequence[RawMessage]) -> Path:
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for raw in written:
+            if raw.topic not in connections:
+                connections[raw.topic] = writer.add_connection(
+                    raw.topic, raw.type_name, msgdef=DECODER.definition.text, md5sum=DECODER.definition.md5
+                )
+            writer.write(connections[raw.topic], raw.received_ns, raw.raw)
+    return path
+
+
+def records(captured: Sequence[RawMessage], late_ns: int = 0, fields: Sequence[str] = ()) -> Iterator[MessageLine]:
+    capture = Capture([TopicRule("**", fields=tuple(fields))], source_kind="ros1")
+    for raw in captured:
+        line = capture.process(raw._replace(received_ns=raw.received_ns + late_ns), T0)
+        assert line is not None
+        found = parse_line(line.line)
+        assert isinstance(found, MessageLine)
+        yield found
+
+
+def told(comparison: Comparison) -> tuple[int, int]:
+    return comparison.equal, comparison.wrong
+
+
+@pytest.mark.parametrize("late_ns", [0, 3_000_000, -3_000_000])
+@pytest.mark.parametrize("fields", [(), ("n", "raw"), ("names[1]",)])
+def test_what_was_replayed_or_recorded_beside_the_robot_is_equal(tmp_path, late_ns, fields):
+    written = messages(50)
+    path = bag(tmp_path / "my.bag", written)
+    assert told(compare(path, ["/t"], records(written, late_ns, fields))) == (50, 0)
+    choice = time_of(path)
+    assert all(choice.wants(one.topic, one.received_ns, one.received_ns) for one in records(written, late_ns))
+
+
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("late_ns", [0, 3_000_000])
+@pytest.mark.parametrize("gone", [0, 20, 49])
+def test_a_record_that_is_missing(tmp_path, gone, late_ns, same):
+    written = messages(50, same=same)
+    path = bag(tmp_path / "my.bag", written)
+    there = [*written[:gone], *written[gone + 1 :]]
+    made = compare(path, ["/t"], records(there, late_ns))
+    assert told(made) == (49, 1)
+    assert "the chain has no record of" in made.differences[0]
+    assert told(compare(path, ["/t"], records(there, late_ns), some=True)) == (49, 0)
+
+
+@pytest.mark.parametrize("late_ns", [0, 3_000_000])
+@pytest.mark.parametrize("twice", [0, 20, 49])
+def test_a_record_that_is_doubled(tmp_path, twice, late_ns):
+    written = messages(50)
+    made = compare(
+        bag(tmp_path / "my.bag", written), ["/t"], records([*written[: twice + 1], *written[twice:]], late_ns)
+    )
+    assert told(made) == (50, 1)
+    assert "the bag has no such message" in made.differences[0]
+
+
+def test_a_field_that_differs_is_told_by_its_path(tmp_path):
+    written = messages(50)
+    found = list(records(written))
+    found[7] = found[7]._replace(data=found[7].data | {"f": 0.25})
+    found[9] = found[9]._replace(data=found[9].data | {"names": ["a", "\x1b"]})
+    found[11] = found[11]._replace(data=found[11].data | {"more": 1})
+    made = compare(bag(tmp_path / "my.bag", written), ["/t"], iter(found))
+    assert told(made) == (47, 3)
+    assert made.differences[0] == "/t at 2025-11-21T01:53:20.700Z: f is 0.25 instead of 0.5"
+    assert "names[1]" in made.differences[1]
+    assert all(text.isprintable() for text in made.differences)
+    late = [one._replace(received_ns=one.received_ns + 1000) for one in found]
+    made = compare(tmp_path / "my.bag", ["/t"], iter(late))
+    assert (made.equal, made.wrong) == (47, 6), "a message without a record, and a record without a message, each"
+    assert any("in the nearest, f is 0.25 instead of 0.5" in text for text in made.differences)
+
+
+def test_records_in_another_order(tmp_path):
+    written = messages(50)
+    found = list(records(written))
+    found[20], found[21] = found[21], found[20]
+    made = compare(bag(tmp_path / "my.bag", written), ["/t"], iter(found))
+    assert told(made) == (49, 2)
+
+
+def test_a_topic_that_is_not_on_the_chain_is_a_difference_where_it_is_asked_for(tmp_path):
+    here, there = messages(20), messages(20, "/u")
+    path = bag(tmp_path / "my.bag", sorted([*here, *there], key=lambda raw: raw.received_ns))
+    made = compare(path, [], records(here))
+    assert (told(made), made.absent) == ((20, 0), ["/u"])
+    made = compare(path, ["/t", "/u"], records(here))
+    assert told(made) == (20, 1)
+    assert "any of the 20 messages on this topic" in made.differences[0]
+
+
+def test_records_of_other_topics_and_other_times_are_not_looked_at(tmp_path):
+    written = messages(20)
+    before = [raw._replace(received_ns=raw.received_ns - 10**12) for raw in written]
+    after = [raw._replace(received_ns=raw.received_ns + 10**12) for raw in written]
+    found = records([*before, *messages(3, "/x"), *written, *after])
+    assert told(compare(bag(tmp_path / "my.bag", written), ["/t"], found)) == (20, 0)
+
+
+@pytest.mark.parametrize(
+    "data", [{}, {"n": []}, {"n": {}}, {"names": 5}, {"names": [1]}, {"names": {"9": "a"}}, {"at": {}}, {"raw": [1]},
+             {"nothing": {"x": 1}}, {"sm3": 1, "length": 2}, {"n": {"sm3": "", "length": 1}}, {"b": 253}],
+)  # fmt: skip
+def test_whatever_a_robot_signed_is_a_difference_and_no_traceback(tmp_path, data):
+    written = messages(1)
+    [one] = records(written)
+    assert compare(bag(tmp_path / "my.bag", written), ["/t"], [one._replace(data=data)]).wrong == 1
+
+
+def test_many_differences_are_counted_and_the_first_are_told(tmp_path):
+    written = messages(400)
+    found = (one._replace(data={"n": -1}) for one in records(written))
+    made = compare(bag(tmp_path / "my.bag", written), ["/t"], found)
+    assert (made.equal, made.wrong, len(made.differences)) == (0, 400, MAX_DIFFERENCES)
+
+
+def test_memory_holds_two_seconds_of_a_bag(tmp_path):
+    written = [raw._replace(raw=thing(n, text=f"{n}" * 4_000)) for n, raw in enumerate(messages(900))]
+    path = bag(tmp_path / "my.bag", written)
+    tracemalloc.start()
+    try:
+        assert compare(path, ["/t"], records(written)).equal == 900
+        assert tracemalloc.get_traced_memory()[1] < sum(len(raw.raw) for raw in written) / 3
+    finally:
+        tracemalloc.stop()
