@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -12,11 +13,13 @@ import pytest
 from bridge.chunks import chain as chunk_chain
 from bridge.operations.conftest import PASSWORD, Place
 from rosbridge_eth import chunk
+from rosbridge_eth.capture import Capture, TopicRule
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.identity import load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
 from smcrypto import sm2
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "operations.md"
@@ -25,6 +28,7 @@ ROWS = re.findall(r"^\| `([a-z]+)` \| ([^|]+) \| (\d+) \|", TABLE, re.MULTILINE)
 TK, STREAM = robot_id("robot_1"), b"s" * 16
 OPERATOR, READER = ("--passphrase-file", "pass"), ("--passphrase-file", "readers")
 REVOKE = ("revoke", "robot_1", "--compromised", *OPERATOR)
+COMPARE = ("compare", str(sample_bag()), "robot_1", "--topic", "/robot_1/odom", *READER)
 CHECK = ("check", "robot_1", STREAM.hex(), "0")
 Given = Callable[[Place, Keyring], object]
 
@@ -46,18 +50,33 @@ def dead(place: Place, keys: Keyring) -> None:
     inbox.close()
 
 
-def written(place: Place, keys: Keyring, reader: sm2.PublicKey | None = None) -> None:
+STREAM_LINE = b'{"stream":{"source":"sim","software":"a test"}}'
+
+
+def written(
+    place: Place, keys: Keyring, reader: sm2.PublicKey | None = None, lines: Sequence[bytes] = (STREAM_LINE,)
+) -> None:
     """One chunk of the robot on the chain, for this reader or for one of whom nobody knows."""
     who, _ = load_identity(place.robot.identity, PASSWORD)
     [standing] = place.ledger.standings([TK])
     account = next(keys.robot(number) for number in range(1, 9) if keys.robot(number).address == standing.account)
     log = Log(place.operator.deployment().ledger, TK)
     made = chunk.seal(
-        log, who.signing_key, [b'{"stream":{"source":"sim","software":"a test"}}'], stream=STREAM, number=0,
+        log, who.signing_key, lines, stream=STREAM, number=0,
         previous=bytes(32), sealed_ms=time.time_ns() // 10**6, goodbye=False, compress=True,
         readers=[reader or sm2.PrivateKey.generate().public_key],
     )  # fmt: skip
     place.ledger.set_data(account, TK, [made.encoded])
+
+
+def replayed(place: Place, keys: Keyring, without: int | None = None) -> None:
+    """The sample bag on the chain, but for one message."""
+    capture, source = Capture([TopicRule("**")], source_kind="bag"), BagSource(sample_bag(), Selection(["**/odom"]))
+    lines = [found.line for raw in source.messages() if (found := capture.process(raw, raw.received_ns))]
+    source.close()
+    lines = [line for n, line in enumerate(lines) if n != without]
+    owner, _ = load_identity(place.path / "reader", b"the reader's own words")
+    written(place, keys, owner.encryption_key.public_key, [STREAM_LINE, *lines])
 
 
 def forged(place: Place, keys: Keyring) -> None:
@@ -79,6 +98,9 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("what is there is not what", ("read", "robot_1", *READER), forged),
     ("it is sound, and every record is sealed for others", ("read", "robot_1", *READER), written),
     ("no robot of that name is in the contract", ("read", "robot_9", *READER), as_it_is),
+    ("every message of the bag is on the chain", COMPARE, replayed),
+    ("one is missing", COMPARE, lambda place, keys: replayed(place, keys, without=7)),
+    ("there is no such bag", ("compare", "none.bag", "robot_1", *READER), replayed),
     ("shown", ("status",), as_it_is),
     ("the node is on another chain", ("status",), as_it_is),
     ("something is broken", ("doctor",), lambda place, keys: place.path.joinpath("operator").chmod(0o777)),
@@ -107,6 +129,21 @@ def test_the_exit_code_is_the_one_of_the_table(
         monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(node, at, **more))
     given(place, keys)
     assert run(arguments) == int(code), capsys.readouterr().err
+
+
+def test_compare_says_what_is_missing_and_how_much_is_equal(
+    place: Place, keys: Keyring, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    connect = Ledger.connect
+    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
+    replayed(place, keys, without=7)
+    assert run([*COMPARE, "--json"]) == 9
+    said = capsys.readouterr()
+    assert "the chain has no record of this message" in said.err
+    told = json.loads(said.out)
+    assert (told["sound"], told["equal"], told["wrong"], told["absent"]) == (True, 299, 1, [])
+    assert run([*COMPARE, "--some"]) == 0
+    assert run(["compare", *COMPARE[1:3], *READER]) == 9, "without --topic, too"
 
 
 def test_one_record_that_opens_is_enough(place: Place, keys: Keyring, monkeypatch: pytest.MonkeyPatch):
