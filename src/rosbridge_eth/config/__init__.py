@@ -5,14 +5,6 @@ from rosbridge_eth.config.models import ReaderConfig, RobotConfig, ServerConfig,
 from rosbridge_eth.config.values import Address
 
 __all__ = [
-    "Address",
-    "ReaderConfig",
-    "RobotConfig",
-    "ServerConfig",
-    "TopicConfig",
-    "load_reader_config",
-    "load_robot_config",
-    "load_server_config",
-    "parse_config",
-    "reread",
-]
+    "Address", "ReaderConfig", "RobotConfig", "ServerConfig", "TopicConfig", "load_reader_config",
+    "load_robot_config", "load_server_config", "parse_config", "reread",
+]  # fmt: skip

@@ -80,20 +80,12 @@ def _read(path: Path, example: str) -> str:
 # Sentences
 
 _EXPECTED = {
-    "string_type": "a string in quotes",
-    "int_type": "a whole number",
-    "int_from_float": "a whole number",
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "bool_type": "true or false",
-    "list_type": "a list in [ ]",
-    "dict_type": "a table",
-    "model_type": "a table",
-    "greater_than": "more than {gt}",
-    "greater_than_equal": "at least {ge}",
-    "less_than": "less than {lt}",
-    "less_than_equal": "at most {le}",
-}
+    "string_type": "a string in quotes", "int_type": "a whole number", "int_from_float": "a whole number",
+    "float_type": "a number", "finite_number": "a finite number", "bool_type": "true or false",
+    "list_type": "a list in [ ]", "dict_type": "a table", "model_type": "a table",
+    "greater_than": "more than {gt}", "greater_than_equal": "at least {ge}",
+    "less_than": "less than {lt}", "less_than_equal": "at most {le}",
+}  # fmt: skip
 REMOVED = {
     "delivery": "every record is kept in the log; `rate` makes fewer of them",
     "acknowledge": "every chunk is kept until it is confirmed on the chain",
@@ -172,12 +164,8 @@ def _key(location: Sequence[str | int]) -> str:
 
 
 def _allowed_keys(model: type[Section], location: Sequence[str | int]) -> list[str]:
-    """The keys of the table at `location`, walking the models' annotations."""
-    tables: list[type[BaseModel]] = [model]
-    for part in location:
-        if isinstance(part, str):
-            tables = [below for table in tables if part in table.model_fields
-                      for below in _models_in(table.model_fields[part].annotation)]
+    """The keys of the table at `location`: no table holds another, but for those of a list."""
+    tables = _models_in(model.model_fields[str(location[0])].annotation) if location else [model]
     return sorted({field.alias or name for table in tables for name, field in table.model_fields.items()})
 
 

@@ -133,9 +133,8 @@ class TopicConfig(Section):
     @validator(mode="after")
     def _consistent(self) -> TopicConfig:
         parse_paths(self.fields)
-        given = {"from": self.from_, "until": self.until, "for": self.for_, "once": self.once or None,
-                 "rate": self.rate}
-        if self.at is not None and (also := [key for key, value in given.items() if value is not None]):
+        given = {"from": self.from_, "until": self.until, "for": self.for_, "once": self.once, "rate": self.rate}
+        if self.at is not None and (also := [key for key, value in given.items() if value]):
             raise ValueError(f"has both `at` and {', '.join(also)}; a moment is one message, choose one")
         if self.until is not None and self.for_ is not None:
             raise ValueError("has both `until` and `for`; choose one")
@@ -338,9 +337,8 @@ class RobotConfig(Section):
         """For capture.Capture. What a node publishes is captured by the defaults."""
         return [
             TopicRule(
-                topic.topic, fields=tuple(topic.fields), rate=topic.rate, at_ns=topic.at, once=topic.once,
-                from_ns=topic.from_, until_ns=topic.until, for_ns=topic.for_, oversize=self.capture.oversize,
-                limit=self.capture.field_limit,
+                topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
+                topic.for_, self.capture.oversize, self.capture.field_limit,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
         ]
@@ -375,7 +373,7 @@ class RobotConfig(Section):
 
     def reader_files(self, joined: Path) -> list[Path]:
         """The readers' certificates: as configured, or those in the folder `joined`. ConfigError if there is none."""
-        files = sorted(joined.glob("*.pem")) if self.readers is None else list(self.readers)
+        files = sorted(joined.glob("*.pem")) if self.readers is None else self.readers
         if absent := [file for file in files if not file.is_file()]:
             raise ConfigError(f"reader certificate {absent[0]} does not exist; correct `readers`")
         if not files:
