@@ -239,10 +239,8 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     beat("robot", wall)
     show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
     CAPTURED.labels(name).set(robot.captured)
-    for (topic, why), count in robot.source.lost.items():
+    for (topic, why), count in {**robot.source.lost, **robot.capture.lost}.items():
         LOST.labels(name, topic, why).set(count)
-    for topic, counted in robot.capture.statistics().items():
-        LOST.labels(name, topic, "refused").set(counted.refused + counted.undecodable)
     spool = robot.spool.statistics()
     for state, chunks in (("all", spool.chunks), ("not stored", spool.unstored), ("set aside", spool.aside)):
         SPOOL_CHUNKS.labels(name, state).set(chunks)

@@ -197,7 +197,7 @@ class Robot:
             self._add_losses(now)
 
     def _add_losses(self, now: float) -> None:
-        for line in self.capture.lost(self.source.lost):
+        for line in self.capture.loss_lines(self.source.lost):
             self.writer.add(line, now)
 
     def _finish(self, now: float) -> None:
@@ -259,10 +259,9 @@ class Robot:
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender.statistics
         left = spool.unstored + len(self._unspooled)
-        topics = self.capture.statistics().values()
         lost = {
             "messages lost before they could be captured": sum(self.source.lost.values()),
-            "messages left out as too large or undecodable": sum(t.refused + t.undecodable for t in topics),
+            "messages left out as too large or undecodable": sum(self.capture.lost.values()),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }

@@ -34,7 +34,7 @@ from rosbags.interfaces.typing import FieldDesc
 
 from rosbridge_eth.capture.definitions import DURATION, TIME, attribute_name
 from rosbridge_eth.capture.messages import Decoder, Wire
-from rosbridge_eth.capture.paths import EVERYTHING, Selection
+from rosbridge_eth.capture.paths import Selection
 from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
 
@@ -54,11 +54,6 @@ NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
 class FieldTooLarge(Exception):
     """A field is above the limit and the policy is to refuse such messages."""
 
-    def __init__(self, path: str, length: int) -> None:
-        super().__init__(f"{path} has {length} bytes")
-        self.path = path
-        self.length = length
-
 
 class Conversion:
     """One type's compiled conversion. `convert(message)` gives the record's data.
@@ -67,13 +62,9 @@ class Conversion:
     """
 
     def __init__(
-        self,
-        decoder: Decoder,
-        selection: Selection = EVERYTHING,
-        *,
-        limit: int = DEFAULT_LIMIT,
+        self, decoder: Decoder, selection: Selection = None, *, limit: int = DEFAULT_LIMIT,
         oversize: OversizePolicy = "digest",
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._fields = decoder.fields
         self._ros1 = decoder.wire is Wire.ROS1
         self._limit = limit
@@ -88,27 +79,22 @@ class Conversion:
     # Each method writes the expression for the value of a field, given the expression for the field itself.
 
     def _message(self, type_name: str, selection: Selection, value: str, path: str) -> str:
-        fields = self._fields[type_name]
-        if not selection.everything:
-            self._check_names(type_name, selection, path)
-            fields = [field for field in fields if field[0] in selection.members]
-        members = []
-        for name, description in fields:
-            chosen = EVERYTHING if selection.everything else selection.members[name]
-            inner = self._value(description, chosen, f"{value}.{attribute_name(name)}", f"{path}.{name}".lstrip("."))
-            members.append(f'"{name}": {inner}')
-        return f"{{{', '.join(members)}}}"
-
-    def _check_names(self, type_name: str, selection: Selection, path: str) -> None:
-        if selection.each or selection.elements:
-            raise ConfigError(f"field {path!r} of {self.type_name} is not an array")
-        names = [name for name, _ in self._fields[type_name]]
-        for name in selection.members:
-            if name not in names:
-                near = difflib.get_close_matches(name, names, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"it has: {', '.join(names) or 'no fields'}"
+        fields = dict(self._fields[type_name])
+        for name in () if selection is None else selection:
+            if isinstance(name, int) or name == "*":
+                raise ConfigError(f"field {path!r} of {self.type_name} is not an array")
+            if name not in fields:
+                near = difflib.get_close_matches(name, fields, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"it has: {', '.join(fields) or 'no fields'}"
                 where = f"field {path!r} of {self.type_name}" if path else self.type_name
                 raise ConfigError(f"{where} has no field {name!r}; {hint}")
+        members = []
+        for name, description in fields.items():
+            if selection is None or name in selection:
+                chosen = None if selection is None else selection[name]
+                attribute = f"{value}.{attribute_name(name)}"
+                members.append(f'"{name}": {self._value(description, chosen, attribute, f"{path}.{name}".lstrip("."))}')
+        return f"{{{', '.join(members)}}}"
 
     def _value(self, description: FieldDesc, selection: Selection, value: str, path: str) -> str:
         if description[0] == Nodetype.BASE:
@@ -120,18 +106,19 @@ class Conversion:
                 return self._instant(description[1], value)
             return self._message(description[1], selection, value, path)
         element = description[1][0]
-        if selection.everything:
-            return self._array(element, EVERYTHING, value, path)
-        if selection.members:
-            raise ConfigError(f"field {path!r} of {self.type_name} is an array; write {path}[*] or {path}[0]")
-        if selection.each is not None:
+        if selection is None:
+            return self._array(element, None, value, path)
+        if "*" in selection:
             if element[0] == Nodetype.BASE:
-                self._check_leaf(selection.each, f"{path}[*]", f"a {element[1][0]}")
-            return self._array(element, selection.each, value, path)
-        return self._elements(element, selection.elements, value, path)
+                self._check_leaf(selection["*"], f"{path}[*]", f"a {element[1][0]}")
+            return self._array(element, selection["*"], value, path)
+        elements = {step: selection[step] for step in selection if isinstance(step, int)}
+        if len(elements) < len(selection):
+            raise ConfigError(f"field {path!r} of {self.type_name} is an array; write {path}[*] or {path}[0]")
+        return self._elements(element, elements, value, path)
 
     def _check_leaf(self, selection: Selection, path: str, what: str) -> None:
-        if not selection.everything:
+        if selection is not None:
             raise ConfigError(f"field {path!r} of {self.type_name} is {what}: nothing can be selected in it")
 
     def _scalar(self, base: str, value: str, path: str) -> str:
@@ -162,12 +149,10 @@ class Conversion:
     def _elements(self, element: FieldDesc, elements: dict[int, Selection], value: str, path: str) -> str:
         """The chosen ones by index, as far as the array has them."""
         item = self._call(None)
-        convert = {
-            index: eval(  # noqa: S307
-                f"lambda {item}: {self._value(element, selection, item, f'{path}[{index}]')}", self._names
-            )
-            for index, selection in sorted(elements.items())
-        }
+        convert = {}
+        for index, selection in sorted(elements.items()):
+            inner = self._value(element, selection, item, f"{path}[{index}]")
+            convert[index] = eval(f"lambda {item}: {inner}", self._names)  # noqa: S307
 
         def choose(array: Any) -> dict[str, Any]:
             items = array.tolist() if isinstance(array, numpy.ndarray) else array
@@ -213,15 +198,11 @@ class Conversion:
 
     def _too_large(self, path: str, content: bytes) -> dict[str, Any]:
         if self._refuse:
-            raise FieldTooLarge(path, len(content))
+            raise FieldTooLarge(f"{path} has {len(content)} bytes")
         self.digested += 1
         self.last_digested = path
         return {"sm3": sm3.digest(content).hex(), "length": len(content)}
 
 
 def _float(value: float) -> float | str:
-    if isfinite(value):
-        return value
-    if value == inf:
-        return "Infinity"
-    return "-Infinity" if value == -inf else "NaN"
+    return value if isfinite(value) else {inf: "Infinity", -inf: "-Infinity"}.get(value, "NaN")

@@ -22,11 +22,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 import orjson
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import BaseDesc, Fielddefs, FieldDesc, NameDesc, Typesdict
+from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
 
 from rosbridge_eth.capture.idl import idl_as_msg
 from rosbridge_eth.errors import SourceError
@@ -130,11 +130,9 @@ def normalised_type_name(name: str) -> str:
     parts = name.split("/")
     if len(parts) == 2:
         parts.insert(1, "msg")
-    if len(parts) != 3 or parts[1] not in ("msg", "srv", "action"):
+    legal = all(len(part) <= MAX_NAME and _TYPE_NAME.fullmatch(part) for part in parts)
+    if len(parts) != 3 or parts[1] not in ("msg", "srv", "action") or not legal:
         raise DefinitionError(f"{_shown(name)} is not a message type's name, such as nav_msgs/Odometry")
-    for part in parts:
-        if len(part) > MAX_NAME or not _TYPE_NAME.fullmatch(part):
-            raise DefinitionError(f"{_shown(name)} is not a message type's name, such as nav_msgs/Odometry")
     return "/".join(parts)
 
 
@@ -233,42 +231,33 @@ class _Checker:
 
     def _field(self, where: str, description: FieldDesc, depth: int) -> int:
         if description[0] == Nodetype.BASE:
-            return self._base(where, description[1])
+            name, bound = description[1]
+            if not 0 <= bound <= MAX_COUNT:
+                raise DefinitionError(f"{where} has a length out of range: {bound}")
+            if name in _UNSUPPORTED:
+                raise DefinitionError(f"{where} is a {name}, not supported: its wire form differs between middlewares")
+            if name not in _BASES:
+                raise DefinitionError(f"{where} has the unknown type {_shown(name)}")
+            return SIZES.get(name, 4)
         if description[0] == Nodetype.NAME:
             return self.visit(description[1], depth + 1)
         element, count = description[1]
         if not 0 <= count <= MAX_COUNT:
             raise DefinitionError(f"{where} has an array length out of range: {count}")
-        if element[0] == Nodetype.BASE:
-            size = self._base(where, element[1])
-            unrolls = element[1][0] == "string"
-        else:
-            size = self.visit(element[1], depth + 1)
-            unrolls = True
+        size = self._field(where, element, depth)
         if size == 0:
             raise DefinitionError(f"{where} is an array of empty messages")
         if description[0] == Nodetype.SEQUENCE:
             return 4
         if count == 0:
             raise DefinitionError(f"{where} is a fixed array of no elements")
-        if unrolls:
+        if element[0] == Nodetype.NAME or element[1][0] == "string":
             self.unrolled += count
             if self.unrolled > MAX_UNROLLED:
                 raise DefinitionError(f"{where}: more than {MAX_UNROLLED} elements in fixed arrays of this kind")
         elif count * size > MAX_FIXED_BYTES:
             raise DefinitionError(f"{where} is a fixed array of {count * size} bytes; at most {MAX_FIXED_BYTES}")
         return count * size
-
-    @staticmethod
-    def _base(where: str, base: tuple[str, int]) -> int:
-        name, bound = base
-        if not 0 <= bound <= MAX_COUNT:
-            raise DefinitionError(f"{where} has a length out of range: {bound}")
-        if name in _UNSUPPORTED:
-            raise DefinitionError(f"{where} is a {name}, whose wire form differs between middlewares; not supported")
-        if name not in _BASES:
-            raise DefinitionError(f"{where} has the unknown type {_shown(name)}")
-        return SIZES.get(name, 4)
 
 
 def attribute_name(field: str) -> str:
@@ -343,10 +332,12 @@ def _parse_line(owner: str, line: str) -> tuple[str, FieldDesc] | None:
         raise DefinitionError(f"a line in the definition of {owner} is not a field: {_shown(line)}")
     if match["constant"]:
         return None
-    element = _element(owner, match["type"], int(match["string_bound"] or 0))
-    if match["string_bound"] and match["type"] not in ("string", "wstring"):
+    kind, bound = match["type"], match["string_bound"]
+    if bound and kind not in ("string", "wstring"):
         raise DefinitionError(f"in the definition of {owner}, only a string has a bound: {_shown(line)}")
-    description: FieldDesc = element
+    known = kind in _BASES or kind in _UNSUPPORTED
+    element: Any = (Nodetype.BASE, (kind, int(bound or 0))) if known else (Nodetype.NAME, _full_name(owner, kind))
+    description: Any = element
     if match["array"]:
         if match["count"] and not match["bounded"]:
             description = (Nodetype.ARRAY, (element, int(match["count"])))
@@ -355,12 +346,6 @@ def _parse_line(owner: str, line: str) -> tuple[str, FieldDesc] | None:
         else:
             raise DefinitionError(f"in the definition of {owner}, an array bound has no number: {_shown(line)}")
     return match["name"], description
-
-
-def _element(owner: str, name: str, bound: int) -> BaseDesc | NameDesc:
-    if name in _BASES or name in _UNSUPPORTED:
-        return cast(BaseDesc, (Nodetype.BASE, (name, bound)))
-    return (Nodetype.NAME, _full_name(owner, name))
 
 
 def _full_name(owner: str, name: str) -> str:

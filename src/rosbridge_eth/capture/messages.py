@@ -38,7 +38,7 @@ class DecodeError(SourceError):
 
 
 class Wire(StrEnum):
-    """How a message is written as bytes."""
+    """How a message is written as bytes, by rosbags' names."""
 
     ROS1 = "ros1"  # little-endian, unaligned; time is unsigned
     CDR = "cdr"  # OMG CDR with encapsulation header, as ROS 2 has it
@@ -74,17 +74,14 @@ class Decoder:
         if len(raw) > self.max_raw:
             raise DecodeError(f"a {self.type_name} of {len(raw)} bytes is not decoded; at most {self.max_raw}")
         try:
-            if self.wire is Wire.ROS1:
-                return self.typestore.deserialize_ros1(raw, self.type_name)
-            return self.typestore.deserialize_cdr(raw, self.type_name)
+            decoded: object = getattr(self.typestore, f"deserialize_{self.wire}")(raw, self.type_name)
+            return decoded
         except SerdeError as error:
             raise DecodeError(str(error)) from error
 
     def encode(self, message: object) -> bytes:
         """The bytes of a message object; what a simulation publishes and a reader writes to a bag."""
-        if self.wire is Wire.ROS1:
-            return bytes(self.typestore.serialize_ros1(message, self.type_name))
-        return bytes(self.typestore.serialize_cdr(message, self.type_name))
+        return bytes(getattr(self.typestore, f"serialize_{self.wire}")(message, self.type_name))
 
 
 class RawMessage(NamedTuple):

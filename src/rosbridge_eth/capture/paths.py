@@ -14,59 +14,38 @@ data as {"pose": {"pose": {"position": {"x": ...}}}}, and `ranges[0]` as
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
 
 _SEGMENT = re.compile(r"([A-Za-z][A-Za-z0-9_]*)(?:\[(\*|[0-9]{1,9})\])?", re.ASCII)
 
-
-@dataclass
-class Selection:
-    """A tree of what is selected: everything below, or these members, or these elements."""
-
-    everything: bool = False
-    members: dict[str, Selection] = field(default_factory=dict)
-    each: Selection | None = None
-    elements: dict[int, Selection] = field(default_factory=dict)
+Step: TypeAlias = str | int
+"""The name of a field, an index, or "*" for every element."""
+Selection: TypeAlias = "Mapping[Step, Selection] | None"
+"""What is selected below each step; None is everything."""
 
 
-EVERYTHING = Selection(everything=True)
-
-
-def parse_path(path: str) -> tuple[str | int | None, ...]:
-    """Steps of a path: a name, an index, or None for every element. Raises ValueError with a sentence."""
-    steps: list[str | int | None] = []
+def parse_path(path: str) -> tuple[Step, ...]:
+    """Steps of a path. Raises ValueError with a sentence."""
+    steps: list[Step] = []
     for segment in path.split("."):
         match = _SEGMENT.fullmatch(segment)
         if match is None:
             raise ValueError(f"{path!r} is not a field path, such as pose.pose.position.x or ranges[0]")
         name, index = match.groups()
-        steps.append(name)
-        if index is not None:
-            steps.append(None if index == "*" else int(index))
+        steps += [name] if index is None else [name, "*" if index == "*" else int(index)]
     return tuple(steps)
 
 
 def parse_paths(paths: Iterable[str]) -> Selection:
-    """The union of the paths; "*" is the whole message. Raises ValueError with a sentence."""
-    root = Selection()
-    for path in paths:
-        node = root
-        for step in () if path == "*" else parse_path(path):
-            if isinstance(step, str):
-                node = node.members.setdefault(step, Selection())
-            elif step is None:
-                node.each = node.each or Selection()
-                node = node.each
-            else:
-                node = node.elements.setdefault(step, Selection())
-        node.everything = True
-    _check(root)
-    return root
+    """The union of the paths; "*" is the whole message, and so is no path. Raises ValueError with a sentence."""
+    return _union([() if path == "*" else parse_path(path) for path in paths])
 
 
-def _check(node: Selection) -> None:
-    if node.each is not None and node.elements and not node.everything:
+def _union(paths: Sequence[tuple[Step, ...]]) -> Selection:
+    if not paths or () in paths:
+        return None
+    first = dict.fromkeys(path[0] for path in paths)
+    if "*" in first and any(isinstance(step, int) for step in first):
         raise ValueError("one array is selected by [*] and by an index; choose one of them")
-    for below in (*node.members.values(), *node.elements.values(), *([node.each] if node.each else ())):
-        _check(below)
+    return {step: _union([path[1:] for path in paths if path[0] == step]) for step in first}

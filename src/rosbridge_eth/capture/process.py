@@ -7,6 +7,7 @@ counters say how often it happened. Not thread-safe: one thread feeds one Captur
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -17,7 +18,7 @@ import orjson
 from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
 from rosbridge_eth.capture.lines import MAX_LINE, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
-from rosbridge_eth.capture.paths import EVERYTHING, Selection, parse_paths
+from rosbridge_eth.capture.paths import Selection, parse_paths
 from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, rule_for
 from rosbridge_eth.errors import ConfigError
 
@@ -38,6 +39,9 @@ class Cause(StrEnum):
     UNDECODABLE = "undecodable"
 
 
+_LOSSES: Final = frozenset(Cause) - {Cause.FIELD_DIGESTED}
+
+
 class Captured(NamedTuple):
     """What became of a message: `line` is the record; data is JSON-ready, see conversion."""
 
@@ -49,33 +53,12 @@ class Captured(NamedTuple):
     data: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class TopicStatistics:
-    """Messages of one topic so far. seen = captured + not_due + refused + undecodable."""
-
-    seen: int = 0
-    captured: int = 0
-    not_due: int = 0
-    refused: int = 0
-    undecodable: int = 0
-    fields_digested: int = 0
-
-
 @dataclass
 class _Topic:
     rule: TopicRule
     selection: Selection
     schedule: Schedule
     conversions: dict[Decoder, Conversion] = field(default_factory=dict)
-    captured: int = 0
-    not_due: int = 0
-    counts: dict[Cause, int] = field(default_factory=lambda: dict.fromkeys(Cause, 0))
-
-    def statistics(self) -> TopicStatistics:
-        digested, undecodable = self.counts[Cause.FIELD_DIGESTED], self.counts[Cause.UNDECODABLE]
-        left_out = sum(self.counts.values()) - digested
-        seen = self.captured + self.not_due + left_out
-        return TopicStatistics(seen, self.captured, self.not_due, left_out - undecodable, undecodable, digested)
 
 
 class Capture:
@@ -84,25 +67,25 @@ class Capture:
     source_kind: stands in every line.
     live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
     that is an error of the configuration.
+    counts: messages so far by topic and what became of them: captured, not_due, or a Cause other than FIELD_DIGESTED,
+    which counts fields.
     """
 
     def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
+        self.counts: Counter[tuple[str, str]] = Counter()
         self._topics: dict[str, _Topic | None] = {}
         self._source_kind = source_kind
         self._live = live
-        self._declared: dict[tuple[str, str], int] = {}  # losses that are in a line already, by topic and why
+        self._declared: Counter[tuple[str, str]] = Counter()  # losses that are in a line already, by topic and why
         self.take_up(rules)
 
     def take_up(self, rules: Sequence[TopicRule]) -> None:
-        """Go on by other rules. A topic whose rule stays the same goes on as it is; of others the counts begin anew,
-        so `lost` is asked before. Raises ValueError."""
+        """Go on by other rules. A topic whose rule stays the same goes on as it is. Raises ValueError."""
         self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
-        self._selections = {id(rule): parse_paths(rule.fields) if rule.fields else EVERYTHING for rule in rules}
+        self._selections = {id(rule): parse_paths(rule.fields) for rule in rules}
         self._topics = {name: topic for name, topic in self._topics.items()
                         if topic is not None and topic.rule == rule_for(name, self._rules)}  # fmt: skip
-        self._declared = {(name, why): count for (name, why), count in self._declared.items()
-                          if name in self._topics or why not in set(Cause)}  # fmt: skip
 
     def process(self, raw: RawMessage, wall_ns: int, clock_synchronised: bool = False) -> Captured | None:
         """The record of a message, or None if it is not due, refused or cannot be decoded.
@@ -113,7 +96,7 @@ class Capture:
         if topic is None:
             return None
         if not topic.schedule.due(raw.received_ns):
-            topic.not_due += 1
+            self.counts[raw.topic, "not_due"] += 1
             return None
         try:
             conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
@@ -124,24 +107,24 @@ class Capture:
         except ConfigError as error:
             if not self._live:
                 raise
-            return self._left_out(raw, topic, Cause.FIELD_MISSING, str(error))
+            return self._left_out(raw, Cause.FIELD_MISSING, str(error))
         except DecodeError as error:
-            return self._left_out(raw, topic, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
+            return self._left_out(raw, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
         except FieldTooLarge as error:
             why = f'{error}, more than {topic.rule.limit}; choose other fields, or oversize = "digest"'
-            return self._left_out(raw, topic, Cause.FIELD_TOO_LARGE, why)
+            return self._left_out(raw, Cause.FIELD_TOO_LARGE, why)
         line = orjson.dumps({
             "topic": raw.topic, "type": raw.type_name, "source": self._source_kind,
             "received_ns": raw.received_ns, "captured_ns": wall_ns, "clock": clock_synchronised, "data": data,
         })  # fmt: skip
         if len(line) > MAX_LINE:
             why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
-            return self._left_out(raw, topic, Cause.RECORD_TOO_LARGE, why)
+            return self._left_out(raw, Cause.RECORD_TOO_LARGE, why)
         if conversion.digested > digested_before:
             text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
-            self._count(raw.topic, topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
+            self._count(raw.topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
         topic.schedule.captured(raw.received_ns)
-        topic.captured += 1
+        self.counts[raw.topic, "captured"] += 1
         return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data)
 
     def check(self, topic: str, decoder: Decoder) -> None:
@@ -150,22 +133,16 @@ class Capture:
         if state is not None:
             self._compile(state, decoder)
 
-    def lost(self, source_lost: Mapping[tuple[str, str], int]) -> list[bytes]:
-        """The lines for what was refused here, and lost by the source, since the last call.
+    @property
+    def lost(self) -> dict[tuple[str, str], int]:
+        """Messages that were refused here, by topic and why."""
+        return {key: count for key, count in self.counts.items() if key[1] in _LOSSES}
 
-        source_lost: messages by topic and why since the source was opened, as `Source.lost` has them.
-        """
-        so_far = dict(source_lost)
-        for name, topic in self._topics.items():
-            if topic is not None:
-                so_far |= {(name, str(cause)): topic.counts[cause] for cause in Cause if cause != Cause.FIELD_DIGESTED}
-        new = {key: count - self._declared.get(key, 0) for key, count in so_far.items()}
-        self._declared |= so_far
-        return [lost_line(count, *key) for key, count in new.items() if count > 0]
-
-    def statistics(self) -> Mapping[str, TopicStatistics]:
-        """By topic, in the order in which they were first seen."""
-        return {name: topic.statistics() for name, topic in self._topics.items() if topic is not None}
+    def loss_lines(self, source_lost: Mapping[tuple[str, str], int]) -> list[bytes]:
+        """The lines for what was refused here, and lost by the source (`Source.lost`), since the last call."""
+        so_far = Counter(source_lost) + Counter(self.lost)
+        new, self._declared = so_far - self._declared, so_far
+        return [lost_line(count, *key) for key, count in new.items()]
 
     def _topic(self, name: str) -> _Topic | None:
         if name not in self._topics:
@@ -180,12 +157,12 @@ class Capture:
         topic.conversions[decoder] = conversion
         return conversion
 
-    def _left_out(self, raw: RawMessage, topic: _Topic, cause: Cause, why: str) -> Captured | None:
+    def _left_out(self, raw: RawMessage, cause: Cause, why: str) -> Captured | None:
         """Count it; None is what became of it."""
-        self._count(raw.topic, topic, cause, f"a message is left out: {why}")
+        self._count(raw.topic, cause, f"a message is left out: {why}")
         return None
 
-    def _count(self, name: str, topic: _Topic, cause: Cause, text: str, count: int = 1) -> None:
-        topic.counts[cause] += count
-        if topic.counts[cause] == count:
-            log.warning("%s: %s", name, text)
+    def _count(self, topic: str, cause: Cause, text: str, count: int = 1) -> None:
+        self.counts[topic, cause] += count
+        if self.counts[topic, cause] == count:
+            log.warning("%s: %s", topic, text)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rosbridge_eth.capture import Conversion, DecodeError, Wire, decoder_for
 from rosbridge_eth.capture.conversion import FieldTooLarge
 from rosbridge_eth.capture.messages import MAX_ELEMENTS
-from rosbridge_eth.capture.paths import EVERYTHING, parse_paths
+from rosbridge_eth.capture.paths import parse_paths
 from rosbridge_eth.errors import ConfigError
 
 
@@ -34,7 +34,7 @@ def string(text: str) -> bytes:
 
 def ros1(text: str, raw: bytes, *paths: str, **options):
     decoder = decoder_for(Wire.ROS1, "pkg/Type", text)
-    conversion = Conversion(decoder, parse_paths(paths) if paths else EVERYTHING, **options)
+    conversion = Conversion(decoder, parse_paths(paths), **options)
     return conversion.convert(decoder.decode(raw))
 
 

@@ -296,4 +296,4 @@ def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
         assert (record.source, record.clock) == ("ros1", True)
         assert 0 < record.captured_ns - record.received_ns < 10**10
         assert restoration.decoder.encode(restoration.restore(record.data).message) == raw.raw
-    assert capture.lost(listening.source.lost) == []
+    assert capture.loss_lines(listening.source.lost) == []

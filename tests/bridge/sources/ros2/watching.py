@@ -69,7 +69,7 @@ try:
 except SourceError as error:
     say({"error": str(error)})
     sys.exit(error.exit_code)
-for line in capture.lost(source.lost):
+for line in capture.loss_lines(source.lost):
     say({"declared": json.loads(line)})
 statistics: dict[str, dict[str, int]] = {}
 for topic in dict.fromkeys(topic for topic, _ in source.counts):
