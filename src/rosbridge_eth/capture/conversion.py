@@ -25,7 +25,7 @@ import difflib
 from base64 import b64encode
 from collections.abc import Callable
 from math import inf, isfinite
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final
 
 import numpy
 import orjson
@@ -34,14 +34,9 @@ from rosbags.interfaces.typing import FieldDesc
 
 from rosbridge_eth.capture.definitions import DURATION, TIME, attribute_name
 from rosbridge_eth.capture.messages import Decoder, Wire
-from rosbridge_eth.capture.paths import Selection
+from rosbridge_eth.capture.rules import DEFAULT_LIMIT, OversizePolicy, Selection
 from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
-
-OversizePolicy: TypeAlias = Literal["digest", "refuse"]
-
-DEFAULT_LIMIT: Final = 16 * 1024
-"""Bytes of one field from which on its digest stands for it."""
 
 _BYTES: Final = frozenset({"uint8", "char", "byte"})
 NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {

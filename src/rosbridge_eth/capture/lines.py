@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import orjson
@@ -152,12 +153,5 @@ def _too_deep(line: bytes) -> bool:
     """Whether brackets are nested too deeply outside strings. Before parsing: what follows may recurse."""
     if line.count(b"[") + line.count(b"{") <= MAX_DEPTH:
         return False
-    depth = 0
-    for byte in _STRINGS.sub(b"", line):
-        if byte in b"[{":
-            depth += 1
-            if depth > MAX_DEPTH:
-                return True
-        elif byte in b"]}":
-            depth -= 1
-    return False
+    steps = (1 if byte in b"[{" else -1 for byte in _STRINGS.sub(b"", line) if byte in b"[{]}")
+    return max(accumulate(steps), default=0) > MAX_DEPTH

@@ -18,8 +18,7 @@ import orjson
 from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
 from rosbridge_eth.capture.lines import MAX_LINE, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
-from rosbridge_eth.capture.paths import Selection, parse_paths
-from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, rule_for
+from rosbridge_eth.capture.rules import NamePattern, Schedule, Selection, TopicRule, parse_paths, rule_for
 from rosbridge_eth.errors import ConfigError
 
 MAX_CONVERSIONS: Final = 8

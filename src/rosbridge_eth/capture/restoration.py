@@ -7,11 +7,10 @@ its definition, but for the `seq` of a header, which only ROS 1 has.
 
 from __future__ import annotations
 
-import binascii
 from base64 import b64decode
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from functools import partial
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy
 from rosbags.interfaces import Nodetype
@@ -31,15 +30,11 @@ Builder: TypeAlias = Callable[[Any, list[str]], Any]
 """Takes the JSON value (or _ABSENT) and the list to which paths of what is missing are added."""
 
 
-class _Absent:
-    """Stands for a value that was not captured."""
+_ABSENT: Final = object()
+"""Stands for a value that was not captured."""
 
 
-_ABSENT: Final = _Absent()
-
-
-@dataclass(frozen=True, slots=True)
-class Restored:
+class Restored(NamedTuple):
     """A message object of rosbags, and the paths that are zero in it because they were not captured."""
 
     message: Any
@@ -98,7 +93,12 @@ class Restoration:
 
     def _value(self, description: FieldDesc, path: str) -> Builder:
         if description[0] == Nodetype.BASE:
-            return _string(path) if description[1][0] == "string" else self._number(description[1][0], path)
+            if description[1][0] == "string":
+                return _leaf(path, str, partial(_exactly, str), _is_digest)
+            kind = numpy.dtype(NUMPY[description[1][0]])
+            # A byte is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed.
+            read = _signed if description[1][0] == "byte" else partial(_checked, kind)
+            return _leaf(path, lambda: kind.type(0).item(), read)
         if description[0] == Nodetype.NAME:
             if description[1] in (TIME, DURATION):
                 return self._instant(description[1], path)
@@ -109,38 +109,21 @@ class Restoration:
             return self._numbers(element[1][0], length, path)
         return self._list(self._value(element, f"{path}[*]"), length, path)
 
-    def _number(self, base: str, path: str) -> Builder:
-        kind = numpy.dtype(NUMPY[base])
-        is_byte = base == "byte"  # signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed
-
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT:
-                missing.append(path)
-                return kind.type(0).item()
-            if is_byte and type(data) is int and 0 <= data < 256:
-                return data - 256 if data > 127 else data
-            return _checked(data, kind, path)
-
-        return build
-
     def _numbers(self, base: str, length: int | None, path: str) -> Builder:
-        kind = numpy.dtype(NUMPY[base])
+        kind, binary = numpy.dtype(NUMPY[base]), base in _BYTES
 
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT or (isinstance(data, dict) and base not in _BYTES) or _is_digest(data):
-                missing.append(path)
-                return numpy.zeros(length or 0, kind)
-            if base in _BYTES:
-                array = numpy.frombuffer(_base64(data, path), kind)
-            elif isinstance(data, list):
-                array = numpy.array([_checked(item, kind, path) for item in data], kind)
+        def read(data: Any) -> Any:
+            if binary:
+                array = numpy.frombuffer(b64decode(data, validate=True), kind)
             else:
-                raise _unfit(path, data)
+                array = numpy.array([_checked(kind, item) for item in _exactly(list, data)], kind)
             if length is not None and len(array) != length:
-                raise _unfit(path, data)
+                raise ValueError
             return array
 
-        return build
+        # In place of numbers, single elements may stand in an object.
+        stands_in = _is_digest if binary else lambda data: isinstance(data, dict)
+        return _leaf(path, lambda: numpy.zeros(length or 0, kind), read, stands_in)
 
     def _list(self, builder: Builder, length: int | None, path: str) -> Builder:
         def build(data: Any, missing: list[str]) -> Any:
@@ -158,22 +141,34 @@ class Restoration:
 
     def _instant(self, type_name: str, path: str) -> Builder:
         make = self.decoder.typestore.types[type_name]
-        ros1 = self.decoder.wire is Wire.ROS1
-        unsigned = ros1 and type_name == TIME
+        unsigned = self.decoder.wire is Wire.ROS1 and type_name == TIME
+        first = 0 if unsigned else -_UINT32 // 2
 
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT:
-                missing.append(path)
-                return make(0, 0)
-            if type(data) is not int:
-                raise _unfit(path, data)
-            seconds, nanoseconds = divmod(data, _SECOND)
-            if not (0 <= seconds < _UINT32 if unsigned else -_UINT32 // 2 <= seconds < _UINT32 // 2):
-                raise _unfit(path, data)
+        def read(data: Any) -> Any:
+            seconds, nanoseconds = divmod(_exactly(int, data), _SECOND)
+            if not first <= seconds < first + _UINT32:
+                raise ValueError
             # rosbags writes the seconds as int32: the same 32 bits as ROS 1's uint32.
             return make((seconds + _UINT32 // 2) % _UINT32 - _UINT32 // 2, nanoseconds)
 
-        return build
+        return _leaf(path, lambda: make(0, 0), read)
+
+
+def _leaf(
+    path: str, zero: Callable[[], Any], read: Callable[[Any], Any], stands_in: Callable[[Any], bool] | None = None
+) -> Builder:
+    """The builder of a field without fields. stands_in: whether what is there is not the value, but in its place."""
+
+    def build(data: Any, missing: list[str]) -> Any:
+        if data is _ABSENT or (stands_in is not None and stands_in(data)):
+            missing.append(path)
+            return zero()
+        try:
+            return read(data)
+        except (TypeError, ValueError):
+            raise _unfit(path, data) from None
+
+    return build
 
 
 def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
@@ -192,39 +187,31 @@ def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
         raise VerificationError(f"{captured.type_name} cannot be written as {wire}: {error}") from None
 
 
-def _string(path: str) -> Builder:
-    def build(data: Any, missing: list[str]) -> Any:
-        if data is _ABSENT or _is_digest(data):
-            missing.append(path)
-            return ""
-        if not isinstance(data, str):
-            raise _unfit(path, data)
-        return data
-
-    return build
+def _exactly(kind: type, data: Any) -> Any:
+    if type(data) is not kind:
+        raise TypeError
+    return data
 
 
-def _checked(data: Any, kind: numpy.dtype[Any], path: str) -> Any:
+def _signed(data: Any) -> Any:
+    return data - 256 if type(data) is int and 127 < data < 256 else _checked(numpy.dtype("i1"), data)
+
+
+def _checked(kind: numpy.dtype[Any], data: Any) -> Any:
+    """The number, if it is one of this kind; else ValueError or TypeError."""
+    if kind.kind == "b":
+        return _exactly(bool, data)
     if kind.kind == "f":
         if isinstance(data, str) and data in NOT_FINITE:
             return NOT_FINITE[data]
-        if type(data) is float and abs(data) <= float(numpy.finfo(kind).max):
-            return data
-    elif kind.kind == "b":
-        if type(data) is bool:
-            return data
-    elif type(data) is int:
+        largest = float(numpy.finfo(kind).max)
+        fits = -largest <= _exactly(float, data) <= largest
+    else:
         limits = numpy.iinfo(kind)
-        if limits.min <= data <= limits.max:
-            return data
-    raise _unfit(path, data)
-
-
-def _base64(data: Any, path: str) -> bytes:
-    try:
-        return b64decode(data, validate=True)
-    except (TypeError, ValueError, binascii.Error):
-        raise _unfit(path, data) from None
+        fits = limits.min <= _exactly(int, data) <= limits.max
+    if not fits:
+        raise ValueError
+    return data
 
 
 def _is_digest(data: Any) -> bool:

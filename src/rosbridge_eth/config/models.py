@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Dis
 from pydantic import model_validator as validator
 
 from rosbridge_eth.capture import NamePattern, TopicRule
-from rosbridge_eth.capture.paths import parse_paths
+from rosbridge_eth.capture.rules import parse_paths
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of

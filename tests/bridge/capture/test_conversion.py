@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rosbridge_eth.capture import Conversion, DecodeError, Wire, decoder_for
 from rosbridge_eth.capture.conversion import FieldTooLarge
 from rosbridge_eth.capture.messages import MAX_ELEMENTS
-from rosbridge_eth.capture.paths import parse_paths
+from rosbridge_eth.capture.rules import parse_paths
 from rosbridge_eth.errors import ConfigError
 
 

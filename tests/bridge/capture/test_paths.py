@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosbridge_eth.capture.paths import parse_path, parse_paths
+from rosbridge_eth.capture.rules import parse_path, parse_paths
 
 
 def test_paths_are_steps():
