@@ -99,11 +99,11 @@ def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
 # On the robot
 
 
-def ask_to_join(home: RobotHome, name: str, password: bytes) -> Request:
-    """Make a robot's home with keys of its own, and the request that the operator answers with a bundle."""
+def ask_to_join(home: RobotHome, name: str, password: bytes, config: str = FIRST_CONFIG) -> Request:
+    """Make a robot's home with keys of its own and this robot.toml, and the request that a bundle answers."""
     check_name(name)
     require_empty(home.path)
-    _make_folders(home)
+    _make_folders(home, config)
     keys = [sm2.PrivateKey.generate() for _ in KEY_FILES]
     ids.write_files(home.identity, {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)})
     request = Request.make(name, *keys)
@@ -143,6 +143,16 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     return roots[0].fingerprint().hex()
 
 
+def take_up(home: RobotHome) -> str | None:
+    """Join with the bundle that was put into the home (RobotHome.answer), which then goes; the CA's fingerprint, or
+    None where there is none."""
+    if not home.request.exists() or not home.answer.exists():
+        return None
+    fingerprint = join(home, read_bundle(home.answer.read_bytes()))
+    home.answer.unlink()
+    return fingerprint
+
+
 def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:
     """Return if the certificates are for the keys of this home's request."""
     mend = "this bundle answers the request of a robot that made its own keys: join in that robot's home"
@@ -155,9 +165,9 @@ def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:
         raise IdentityError(f"this bundle answers another request than {home.request}: it is for other keys")
 
 
-def _make_folders(home: RobotHome) -> None:
+def _make_folders(home: RobotHome, config: str = FIRST_CONFIG) -> None:
     """The folders of a robot's home, and the configuration that it begins with."""
     home.readers.mkdir(mode=0o700, parents=True, exist_ok=True)
     home.path.chmod(0o700)
     if not home.config.exists():
-        write_atomically(home.config, FIRST_CONFIG.encode())
+        write_atomically(home.config, config.encode())

@@ -34,7 +34,7 @@ from rosbridge_eth.errors import BridgeError, NetworkError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
-from rosbridge_eth.status import DEAD, ask_monitor, span
+from rosbridge_eth.status import ANSWER_TIME, DEAD, span
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
@@ -47,6 +47,15 @@ LITTLE_ROOM, SOME_ROOM = 64 << 20, 1 << 30  # bytes
 WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
 OLD_HEAD, DEAD_HEAD = 3600.0, 12 * 3600.0  # seconds since the last block
 ANYWHERE = ("0.0.0.0", "::")  # noqa: S104 - what is looked for
+
+
+def ask_monitor(address: tuple[str, int], path: str) -> bytes:
+    """What a monitor answers. OSError, HTTPException."""
+    # 0.0.0.0 is where a monitor may listen; it answers on the loopback.
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address[0], address[0])  # noqa: S104 - not bound here
+    with closing(http.client.HTTPConnection(host, address[1], timeout=ANSWER_TIME)) as connection:
+        connection.request("GET", path)
+        return connection.getresponse().read()
 
 
 class Result(StrEnum):

@@ -20,6 +20,7 @@ A robot's home (made by `join`):
     robot.toml           its topics
     bridge.json          the server, and the ledger it writes to; absent until it has its bundle
     request.json         what it asks the operator to certify, where it made its own keys
+    NAME.bundle          the operator's answer, which `robot` takes up and removes
     identity/            its keys, under its own password, its certificates, and the CA's
     readers/NAME.pem     who may read what it writes
     spool.sqlite         its replica of its log
@@ -216,15 +217,20 @@ class RobotHome:
         self.spool = path / "spool.sqlite"
         self.clock = path / "clock"
 
+    @property
+    def answer(self) -> Path:
+        """Where the bundle that answers the request is put, for `robot` to take up."""
+        return self.path / f"{home_of(self.path, HomeKind.ROBOT)['name']}.bundle"
+
     def save_bridge(self, end: BridgeEnd) -> None:
         _save(self.bridge_file, asdict(end))
 
     def bridge(self) -> BridgeEnd:
         """ConfigError where this is no robot's home, or it has not had its bundle yet."""
-        home_of(self.path, HomeKind.ROBOT, f"run `join BUNDLE --home {self.path}` first")
+        home_of(self.path, HomeKind.ROBOT, f"run `join --name NAME --home {self.path}` first")
         absent = ConfigError(
             f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
-            f" a bundle, and run here `join BUNDLE --home {self.path}`"
+            f" a bundle; put that into {self.path} and run `robot --home {self.path}`"
         )
         return _load(BridgeEnd, self.bridge_file, "join again", absent)
 

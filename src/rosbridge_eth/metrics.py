@@ -1,8 +1,9 @@
 """What the processes count, as Prometheus has it, and the HTTP server of /metrics, /healthz and /readyz.
 
-The server's processes share their counts by prometheus_client's multiprocess mode: files in a folder that the
-environment names before this module is first imported (supervisor.py). The table of docs/operations.md is
-`reference`. The server is healthy while its processes beat, and ready when every condition holds, too.
+A running server or robot has its figures in files of a folder in memory (`shared`, prometheus_client's multiprocess
+mode), to which its home leads: that is how the server's processes share them, and how `status` knows. The table of
+docs/operations.md is `reference`. The server is healthy while its processes beat, and ready when every condition holds,
+too.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ import json
 import os
 import shutil
 import socket
+import tempfile
 import threading
 import time
-from collections.abc import Collection, Mapping
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from prometheus_client import CollectorRegistry, Gauge
+from prometheus_client import CollectorRegistry, Gauge, values
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, ThreadingWSGIServer, generate_latest
 from prometheus_client.multiprocess import MultiProcessCollector
 
@@ -39,6 +43,9 @@ DEADLINE: Final = 10.0  # seconds for a client to send its request and take the 
 LITTLE_ROOM: Final = 64 << 20  # bytes; below this the disk counts as full
 
 REGISTRY = CollectorRegistry()
+_ENVIRONMENT: Final = "PROMETHEUS_MULTIPROC_DIR"
+_LINK: Final = ".figures"  # in the home; leads to the folder
+_PREFIX: Final = "rosbridge-eth-"
 
 
 def _gauge(name: str, help: str, *labels: str) -> Gauge:
@@ -54,11 +61,16 @@ DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by r
 
 CHUNKS = _gauge("chunks", "Chunks that arrived since the process began, by what became of them.", "process", "outcome")
 STORED = _gauge("records_stored", "Lines of the log stored since the process began.", "process", "robot")
+RATE = _gauge("records_per_second", "Lines stored a second, over the last ten.", "robot")
+NEWEST = _gauge("newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "robot")
 SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
 WAITING = _gauge("waiting_chunks", "Chunks in the inbox that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
 OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
 HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` says why.", "robot")
+ON_CHAIN = _gauge("chain_chunks", "Its chunks on the chain.", "robot")
+BLOCK = _gauge("chain_block", "The block that has the newest of them.", "robot")
+GAS = _gauge("gas", "Gas of the transactions sent for it since the submitter began.", "robot")
 SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "count")
 BALANCE = _gauge("treasury_eth", "Balance of the operator's account.", "process")
 HEAD = _gauge("head_block", "Number of the node's latest block.", "process")
@@ -73,13 +85,71 @@ SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave
 CONNECTED = _gauge("connected", "1 while a session with the server stands.", "robot")
 
 
-def collected() -> CollectorRegistry:
-    """The registry to show: of all processes where they share a folder, else of this one."""
-    if "PROMETHEUS_MULTIPROC_DIR" not in os.environ:
+@contextmanager
+def shared(home: Path) -> Iterator[None]:
+    """Inside, this process and those it forks count in files of a folder that `collected` finds by the home.
+
+    They are mapped into memory, and a process that writes to such a file on a full disk is killed: so not on a disk.
+    """
+    link, before, known = home / _LINK, values.ValueClass, os.environ.get(_ENVIRONMENT)
+    shm = "/dev/shm"  # noqa: S108 - a folder of a new name, for this user alone
+    folder = tempfile.mkdtemp(prefix=_PREFIX, dir=shm if os.access(shm, os.W_OK) else None)
+    with suppress(OSError):  # a full disk; then `status` does not know the figures
+        if (old := link.resolve()).name.startswith(_PREFIX):  # left by a process that was killed
+            shutil.rmtree(old, ignore_errors=True)
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder)
+    _forget()
+    os.environ[_ENVIRONMENT] = folder
+    values.ValueClass = values.MultiProcessValue()  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        values.ValueClass = before
+        os.environ.pop(_ENVIRONMENT)
+        if known is not None:
+            os.environ[_ENVIRONMENT] = known
+        _forget()
+        link.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _forget() -> None:
+    """A figure is kept where it was first set: let it be set anew."""
+    for gauge in set(REGISTRY._names_to_collectors.values()):
+        gauge.clear()  # type: ignore[attr-defined]
+
+
+def collected(home: Path | None = None) -> CollectorRegistry:
+    """The registry to show: of what runs with that home (ValueError where nothing does); without one, of all processes
+    where they share a folder, else of this one."""
+    if home is None and _ENVIRONMENT not in os.environ:
         return REGISTRY
     registry = CollectorRegistry()
-    MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+    MultiProcessCollector(registry, None if home is None else home / _LINK)  # type: ignore[no-untyped-call]
     return registry
+
+
+def figures(home: Path) -> list[tuple[str, dict[str, str], float]]:
+    """Name (without its prefix), labels and value of all that the process of that home shows; ValueError, as above."""
+    samples = [sample for family in collected(home).collect() for sample in family.samples]
+    return [(sample.name.removeprefix("rosbridge_eth_"), sample.labels, sample.value) for sample in samples]
+
+
+class Rates:
+    """What a count grows by a second, over the last ten looks, by a name."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, deque[tuple[float, float]]] = {}
+
+    def of(self, name: str, count: float, now: float) -> float:
+        """Take a count in; the rate since the oldest look that is kept."""
+        seen = self._seen.setdefault(name, deque(maxlen=11))
+        seen.append((now, count))
+        return (count - seen[0][1]) / (now - seen[0][0]) if now > seen[0][0] else 0.0
+
+
+_STORED_RATES = Rates()
 
 
 def beat(process: str, wall: float) -> None:
@@ -201,6 +271,8 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         CHUNKS.labels(process, outcome).set(count)
     for robot, records in reception.records.items():
         STORED.labels(process, robot).set(records)
+        RATE.labels(robot).set(_STORED_RATES.of(robot, records, wall))
+        NEWEST.labels(robot).set(reception.newest[robot])
     for session in reception.sessions.values():
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time
@@ -219,6 +291,10 @@ def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
         HELD.labels(name).set(inbox.state(tk).hold is not None)
+        GAS.labels(name).set(submitter.gas[tk])
+        if standing := submitter.standings.get(tk):
+            ON_CHAIN.labels(name).set(standing.chunks)
+            BLOCK.labels(name).set(standing.data_block)
     for what, count in submitter.counts.items():
         SUBMITTER.labels(what).set(count)
     if submitter.head is not None:

@@ -3,7 +3,7 @@
     up      WHERE      01 | stream 16 | number 8 | digest 32
             OFFER      02 | chunk
     down    STORED     11 | stream 16 | 00, or 01 | number 8 | digest 32     00: nothing of this stream is stored
-            CONFIRMED  12 | stream 16 | number 8
+            CONFIRMED  12 | stream 16 | number 8 | block 8
             HOLD       13 | why, UTF-8, at most 400 bytes
             REFUSED    14 | stream 16 | number 8 | why
 
@@ -22,7 +22,7 @@ MAX_WHY = 400
 
 _WHERE, _OFFER, _STORED, _CONFIRMED, _HOLD, _REFUSED = 0x01, 0x02, 0x11, 0x12, 0x13, 0x14
 _WHERE_FORM, _STORED_FORM = struct.Struct(">B16sQ32s"), struct.Struct(">B16s?Q32s")
-_PLACE_FORM = struct.Struct(">B16sQ")
+_PLACE_FORM, _CONFIRMED_FORM = struct.Struct(">B16sQ"), struct.Struct(">B16sQQ")
 
 
 class ProtocolError(Exception):
@@ -52,10 +52,11 @@ class Stored(NamedTuple):
 
 
 class Confirmed(NamedTuple):
-    """Down: everything of the log up to this chunk is confirmed on the chain."""
+    """Down: everything of the log up to this chunk, which is in this block, is confirmed on the chain."""
 
     stream: bytes
     number: int
+    block: int
 
 
 class Hold(NamedTuple):
@@ -86,7 +87,7 @@ def encode(message: Up | Down) -> bytes:
         case Stored(stream, number, digest):
             return _STORED_FORM.pack(_STORED, stream, number is not None, number or 0, digest)
         case Confirmed():
-            return _PLACE_FORM.pack(_CONFIRMED, *message)
+            return _CONFIRMED_FORM.pack(_CONFIRMED, *message)
         case Hold(why):
             return bytes((_HOLD,)) + _reason(why)
         case Refused(stream, number, why):
@@ -125,8 +126,8 @@ def decode_down(data: bytes) -> Down:
         if not known and (number or any(digest)):
             raise ProtocolError("a stream of which nothing is stored, with a chunk")
         return Stored(stream, number if known else None, digest)
-    if kind == _CONFIRMED and len(data) == _PLACE_FORM.size:
-        return Confirmed(*_PLACE_FORM.unpack(data)[1:])
+    if kind == _CONFIRMED and len(data) == _CONFIRMED_FORM.size:
+        return Confirmed(*_CONFIRMED_FORM.unpack(data)[1:])
     if kind == _HOLD:
         return Hold(_why(data[1:]))
     if kind == _REFUSED and len(data) >= _PLACE_FORM.size:

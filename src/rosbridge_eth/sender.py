@@ -52,6 +52,9 @@ class SenderStatistics:
     connected: bool = False
     held: str | None = None
     """Why the server wants nothing at this moment."""
+    confirmed: int = 0
+    newest: Confirmed | None = None
+    """What the server said last of what is confirmed."""
     refusal: str | None = None
     """Why there has been no session since the last one, and what to do about it."""
 
@@ -154,7 +157,8 @@ class Sender:
                 self._client.expecting(self._sent != self._stored)
                 log.debug("stream %s: the server has it up to %s", stream.hex(), number)
             case Confirmed(stream=stream, number=number):
-                self._spool.confirmed(stream, number)
+                self.statistics.confirmed += self._spool.confirmed(stream, number)
+                self.statistics.newest = message
                 log.debug("stream %s: confirmed up to %d", stream.hex(), number)
             case Hold(why=why):
                 self._asked, self.statistics.held = True, why

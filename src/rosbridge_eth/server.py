@@ -57,7 +57,7 @@ class Reception:
 
     certificates: keccak256 of the certificates that the operator's registry has in force for a name, None where the
     name has none; the contract's are in the inbox's state. allowed: whether a session may go on.
-    counts: chunks by outcome; records: by robot's name, those stored.
+    counts: chunks by outcome; records: by robot's name, those stored; newest: when it sealed the last of them.
     """
 
     def __init__(
@@ -78,6 +78,7 @@ class Reception:
         self._look_at = float("-inf")
         self.counts: Counter[str] = Counter()
         self.records: Counter[str] = Counter()
+        self.newest: dict[str, float] = {}
         self.trouble = Trouble(log, "the inbox")
         self._failed_at = float("-inf")
 
@@ -208,6 +209,7 @@ class Reception:
             case Outcome.STORED | Outcome.KNOWN:
                 if outcome is Outcome.STORED:
                     self.records[session.peer.name] += chunk.header.records
+                    self.newest[session.peer.name] = chunk.header.sealed_ms / 1000
                 session.stream = chunk.header.stream
                 answers[id(session)] = session
             case Outcome.DIFFERENT:
@@ -253,7 +255,7 @@ class Reception:
             session.mismatch = None if state.certificates_hash in ours else MISMATCH
             if state.confirmed is not None and state.confirmed != session.confirmed:
                 session.confirmed = state.confirmed
-                self._send(session, Confirmed(*state.confirmed))
+                self._send(session, Confirmed(*state.confirmed, state.block))
             if session.held and now >= session.ask_at and session.mismatch is None:
                 session.ask_at = now + HELD
                 self._answer(session, now)

@@ -201,9 +201,10 @@ class Spool:
         where = f"state IN (?, ?) AND stream = ? AND position <= {_UP_TO}"
         self._change("UPDATE chunk SET state = ?", where, _STORED, _BARE, _WHOLE, stream, stream, _sortable(number))
 
-    def confirmed(self, stream: bytes, number: int) -> None:
-        """This chunk and everything before it in the log leave the spool; what is set aside stays."""
-        self._change("DELETE FROM chunk", f"state != ? AND position <= {_UP_TO}", _ASIDE, stream, _sortable(number))
+    def confirmed(self, stream: bytes, number: int) -> int:
+        """This chunk and everything before it in the log leave the spool; what is set aside stays. Returns how many."""
+        where = f"state != ? AND position <= {_UP_TO}"
+        return self._change("DELETE FROM chunk", where, _ASIDE, stream, _sortable(number))
 
     def set_aside(self, stream: bytes, number: int) -> int:
         """The server will never take this stream from this number on: it is not sent again. Returns how many."""

@@ -1,16 +1,14 @@
 """`status`: what is where, by a home: who is enrolled, connected, waiting or on hold, and what the chain has.
 
-It asks registry, inbox, node and, where `monitor` is configured, the running server or robot; whatever of them does
-not answer, the rest is shown, and a sentence says what is not known and why. Nothing is changed or made.
+It asks registry, inbox, node and the figures of the running server or robot; whatever of them is not there, the rest is
+shown, and a sentence says what is not known and why. Nothing is changed or made.
 """
 
 from __future__ import annotations
 
-import http.client
-import json as jsonlib
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
@@ -40,7 +38,12 @@ FOLLOW_EVERY = 2.0
 PAGE = 200  # rows of the inbox looked through at once
 DEAD = 1000  # dead letters; the inbox keeps no more
 Report = dict[str, Any]
-Figure = tuple[str, Mapping[str, str], float]
+TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
+FEW_DAYS = 7.0
+Figure = tuple[str, dict[str, str], float]
+_OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
+             "chain_block": "block", "on_hold": "hold"}
+"""The server's figures of a robot, and what they are called here."""
 
 
 class Located(NamedTuple):
@@ -119,33 +122,35 @@ def _asking(report: Report, what: str) -> Iterator[None]:
         report["unknown"].append(f"{what}: {error}")
 
 
-def ask_monitor(address: tuple[str, int], path: str) -> bytes:
-    """What a monitor answers. OSError, HTTPException."""
-    # 0.0.0.0 is where a monitor may listen; it answers on the loopback.
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address[0], address[0])  # noqa: S104 - not bound here
-    with closing(http.client.HTTPConnection(host, address[1], timeout=ANSWER_TIME)) as connection:
-        connection.request("GET", path)
-        return connection.getresponse().read()
-
-
-def _figures(report: Report, address: tuple[str, int] | None, whose: str) -> list[Figure]:
-    """What the running process says: its figures with their labels; in the report, whether it is ready."""
-    from prometheus_client.parser import text_string_to_metric_families
+def _running(report: Report, home: Path, expected: Collection[str], whose: str) -> list[Figure]:
+    """What the running process of this home shows: its figures; in the report, the conditions that do not hold."""
+    from rosbridge_eth import metrics
 
     report["process"] = None
-    if address is None:
-        report["unknown"].append(f"the {whose}: its configuration has no `monitor`, so that it cannot be asked")
-        return []
     try:
-        conditions = jsonlib.loads(ask_monitor(address, "/readyz"))["conditions"]
-        families = [*text_string_to_metric_families(ask_monitor(address, "/metrics").decode())]
-        report["process"] = [name for name, holds in conditions.items() if not holds]
-    except (OSError, http.client.HTTPException, ValueError, LookupError, TypeError, AttributeError) as error:
-        kind = type(error).__name__
-        report["unknown"].append(f"the {whose}: no answer from its monitor at port {address[1]} ({kind}); does it run?")
+        holds = metrics.conditions(metrics.collected(home), expected, time.time())
+        if not any(holds[f"{process} runs"] for process in expected):
+            raise ValueError
+    except ValueError:
+        report["unknown"].append(f"the {whose} does not run here: who is connected, rates and gas are not known")
         return []
-    samples = [sample for family in families for sample in family.samples]
-    return [(sample.name.removeprefix("rosbridge_eth_"), sample.labels, sample.value) for sample in samples]
+    report["process"] = [name for name, so in holds.items() if not so]
+    return metrics.figures(home)
+
+
+def _add_figures(report: Report, figures: Collection[Figure]) -> None:
+    """What the server shows of each robot."""
+    now = time.time()
+    for robot in report["robots"].values() if figures else ():
+        robot |= {"connected": False, "address": None}
+    for name, labels, value in sorted(figures, key=lambda figure: figure[2]):
+        robot = report["robots"].get(labels.get("robot"))
+        if robot is not None and name == "session_seen_seconds" and now - value < SEEN:
+            robot |= {"connected": True, "address": labels["address"]}
+        elif robot is not None and name in ("waiting_chunks", "waiting_seconds"):
+            robot.setdefault("waiting", {})["chunks" if name == "waiting_chunks" else "oldest"] = value
+        elif robot is not None and name in _OF_ROBOT:
+            robot[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
 
 
 def _head(report: Report, ledger: Ledger) -> None:
@@ -156,6 +161,12 @@ def _head(report: Report, ledger: Ledger) -> None:
     except ChainError as error:
         report["wrong_chain"] = str(error)
         raise
+
+
+def _server_processes(config: ServerConfig) -> list[str]:
+    from rosbridge_eth.supervisor import SUBMITTER, worker_name
+
+    return [SUBMITTER, *map(worker_name, range(config.workers))]
 
 
 def _operator(place: OperatorHome) -> Report:
@@ -173,14 +184,10 @@ def _operator(place: OperatorHome) -> Report:
         ],
         "robots": {each.name: {"account": each.account, "in_force": each.revoked_at is None}
                    for each in robots.values()},
-        "operator": {"account": place.account, "eth": None}, "contract": None, "node": None, "dead": [], "unknown": [],
+        "operator": {"account": place.account, "eth": None, "days_left": None}, "contract": None, "node": None,
+        "gas_per_day": config.funds.gas_per_day, "dead": [], "unknown": [],
     }  # fmt: skip
-    figures = _figures(report, config.monitor, "server")
-    seen = {labels["robot"]: (at, labels["address"]) for at, labels in sorted(
-        ((value, labels) for name, labels, value in figures if name == "session_seen_seconds"), key=lambda one: one[0])}
-    for name, robot in report["robots"].items() if report["process"] is not None else ():
-        at, address = seen.get(name, (0.0, None))
-        robot |= {"connected": time.time() - at < SEEN, "address": address}
+    _add_figures(report, _running(report, place.path, _server_processes(config), "server"))
     with _asking(report, "the contract"):
         deployment = place.deployment()
         report |= {"contract": deployment.contract, "chain": deployment.chain_id}
@@ -190,9 +197,21 @@ def _operator(place: OperatorHome) -> Report:
             Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
         ) as ledger:
             _head(report, ledger)
-            _add_standings(report, ledger, robots)
             report["operator"]["eth"] = ledger.balance(place.account) / _WEI
+            _add_standings(report, ledger, robots)
+    report["alarms"] = [*_alarms(report)]
     return report
+
+
+def fleet(place: OperatorHome) -> RenderableType:
+    """The picture of a running server at its terminal, from its own figures alone."""
+    from rosbridge_eth.registry import Registry
+
+    with Registry(place.registry) as registry:
+        robots = [robot for robot in registry.robots().values() if robot.revoked_at is None]
+    report: Report = {"robots": {robot.name: {"in_force": True} for robot in robots}, "unknown": [], "dead": []}
+    _add_figures(report, _running(report, place.path, _server_processes(load_server_config(place.config)), "server"))
+    return Group(_robots(report, money=False), *map(Text, _alarms(report)))
 
 
 def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots: Mapping[bytes, Enrolment]) -> None:
@@ -210,19 +229,41 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
 
 
 def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment]) -> None:
-    """What the chain has of each robot, and how long its account lasts at what it spent lately."""
-    head, seconds = report["node"]["block"], 0
+    """What the chain has of each robot, and how long its account and the operator's last at what was spent lately."""
+    head, seconds, total = report["node"]["block"], 0, 0
     before: dict[bytes, Standing] = {}
     with _asking(report, "what robots spend"):
         block = max(1, head - SPENDING_BLOCKS)
         before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
         seconds = ledger.block_time(head) - ledger.block_time(block)
     for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
-        spent = before[tk].balance - now.balance if tk in before else 0
-        days = now.balance / spent * seconds / 86_400 if spent > 0 and seconds > 0 else None
+        spent = max(0, before[tk].balance - now.balance) if tk in before else 0
+        total += spent
         report["robots"][robot.name] |= {
-            "chunks": now.chunks, "eth": now.balance / _WEI, "days_left": days, "revoked_on_chain": now.revoked
-        }
+            "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,
+            "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
+        }  # fmt: skip
+    report["operator"]["days_left"] = _days(report["operator"]["eth"] * _WEI, total, seconds)
+
+
+def _days(balance: float, spent: int, seconds: int) -> float | None:
+    return balance / spent * seconds / 86_400 if spent > 0 and seconds > 0 else None
+
+
+def _alarms(report: Report) -> Iterator[str]:
+    """What somebody has to see to."""
+    for condition in report["process"] or ():
+        yield f"ALARM: the server is not ready: {condition}: no"
+    for name, robot in report["robots"].items():
+        if hold := robot.get("hold"):
+            yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
+        if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
+            yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
+    for each in report["dead"]:
+        yield f"ALARM: dead letters, {each['chunks']} chunks of {each['robot']}: {each['why']}"
+    days = report.get("operator", {}).get("days_left")
+    if days is not None and days < FEW_DAYS:
+        yield f"ALARM: the operator's account, from which robots are paid, lasts {days:.1f} days"
 
 
 def _robot(place: RobotHome) -> Report:
@@ -244,7 +285,7 @@ def _robot(place: RobotHome) -> Report:
             wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped")
             report["figures"] = {
                 " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in _figures(report, config.monitor, "robot") if name in wanted
+                for name, labels, value in _running(report, place.path, ["robot"], "robot") if name in wanted
             }  # fmt: skip
     return report
 
@@ -282,30 +323,40 @@ def _process(report: Report) -> list[tuple[str, object]]:
     return [] if failing is None else [("process", "NOT READY: " + ", ".join(failing) if failing else "ready")]
 
 
-def _show_operator(report: Report) -> Iterator[RenderableType]:
-    columns = ["robot", "state", "session", "on chain", "waiting", "oldest", "ETH", "days"]
-    rows = []
+def _robots(report: Report, *, money: bool = True) -> RenderableType:
+    columns, rows = ["robot", "session", "newest", "records/s", "waiting", "on chain", "gas"], []
     for name, robot in report["robots"].items():
-        waiting, days = robot.get("waiting", {}), robot.get("days_left")
+        waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
+        oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
+        block = f" ({robot['block']:.0f})" if robot.get("block") else ""
         rows.append((
-            name, "in force" if robot["in_force"] else "revoked",
-            {None: "?", False: "no"}.get(robot.get("connected"), robot.get("address")), robot.get("chunks", "?"),
-            waiting.get("chunks", "?"), span(waiting.get("oldest")),
-            f"{robot['eth']:.4f}" if "eth" in robot else "?", "" if days is None else f"{days:.1f}",
+            name, (session or robot["address"]) if robot["in_force"] else "revoked", span(robot.get("newest")),
+            _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
+            _figure(robot, "chunks", ".0f") + block, _figure(robot, "gas", ".3g"),
+            *([_figure(robot, "eth", ".4f"), _figure(robot, "days_left", ".1f")] if money else []),
         ))  # fmt: skip
-    yield table("Robots: session from where, chunks on the chain and waiting for it", columns, rows, right=range(3, 8))
-    eth, contract = report["operator"]["eth"], report["contract"]
+    title = "Robots: chunks that wait (how long) and that are on the chain (in which block the last)"
+    return table(title, [*columns, *(["ETH", "days"] if money else [])], rows, right=range(2, 9))
+
+
+def _figure(of: Mapping[str, Any], key: str, form: str) -> str:
+    """A number, a question mark where it is not known, nothing where there is none."""
+    return "?" if key not in of else "" if of[key] is None else format(of[key], form)
+
+
+def _show_operator(report: Report) -> Iterator[RenderableType]:
+    yield _robots(report)
+    eth, days, contract = report["operator"]["eth"], report["operator"]["days_left"], report["contract"]
     others = [f"{each['role']} {each['name']}" for each in report["names"]
               if each["role"] != Role.ROBOT and each["revoked"] is None]  # fmt: skip
+    treasury = "not known" if eth is None else f"{eth:.4f} ETH" + (f", for {days:.1f} days" if days is not None else "")
     yield table("Server", ["what", "value"], [
         ("contract", f"{contract} on chain {report['chain']}" if contract else "none yet; run `deploy`"),
-        _block(report["node"]), ("treasury", "not known" if eth is None else f"{eth:.4f} ETH"),
-        ("also in force", ", ".join(others)), *_process(report),
-        *(("dead letters", f"{each['chunks']} chunks of {each['robot']}: {each['why']}") for each in report["dead"]),
+        _block(report["node"]), ("treasury", treasury),
+        ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
+        *_process(report),
     ])  # fmt: skip
-    for name, robot in report["robots"].items():
-        if robot.get("hold"):
-            yield f"On hold, {name}: {robot['hold']}."
+    yield from report["alarms"]
     for name, each in {"operator": report["operator"], **report["robots"]}.items():
         if each["account"]:
             yield f"{each['account']}  {name}"  # whole lines, to be copied

@@ -11,19 +11,20 @@ import logging
 import multiprocessing
 import os
 import signal
-import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Collection
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.process import BaseProcess
 from socket import AF_UNIX, SOCK_CLOEXEC, SOCK_DGRAM
 from socket import socket as Socket
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from rosbridge_eth import metrics
 from rosbridge_eth.administration import server_trust
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
@@ -100,17 +101,11 @@ def open_reception(
 ) -> Reception:  # fmt: skip
     """The door of one worker."""
     limits = config.limits
-    server = Server(
-        ServerConfig(
-            modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number,
-            max_connections=limits.connections, handshake_share=limits.handshake_share, source_rate=limits.source_rate,
-        ),
-        identity,
-        server_trust(home, registry),
-        cookie_key(identity),
-        time.monotonic(),
+    channel = ServerConfig(
+        modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number, max_connections=limits.connections,
+        handshake_share=limits.handshake_share, source_rate=limits.source_rate,
     )
-
+    server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
 
     def certificates(name: str) -> bytes | None:
         found = registry.find(Role.ROBOT, name)
@@ -121,7 +116,6 @@ def open_reception(
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
     """The submitter for all robots of a registry."""
-
     known: dict[object, dict[bytes, Enrolment]] = {}  # the robots, by the registry's revision
 
     def robots() -> dict[bytes, Enrolment]:
@@ -155,55 +149,55 @@ class Supervisor:
         self._started_at: dict[str, float] = {}
         self._starts: Counter[str] = Counter()
         self._due: dict[str, float] = {}  # processes that ended, and when they are started again
-        self._short_lives: dict[str, int] = {}
+        self._short_lives: Counter[str] = Counter()
         self._stop, self._again = threading.Event(), threading.Event()
-        self._at_terminal = os.isatty(2)
+        self._at_terminal = os.isatty(0)
         self._pid = os.getpid()
 
     def stop(self) -> None:
         self._stop.set()
 
-    def run(self, on_ready: Callable[[tuple[str, int]], None] = lambda address: None) -> None:
+    def run(
+        self, on_ready: Callable[[tuple[str, int]], None] = lambda address: None,
+        on_look: Callable[[], None] = lambda: None,
+    ) -> None:
         """Check, open the port, start the processes, watch them.
 
         Raises BridgeError before the port is open, and ProcessError where a process does not come up however often
-        it is started. on_ready: called with the address that is listened on.
+        it is started. on_ready: called with the address that is listened on; on_look: after every look at them.
         """
         self._check(self._config)
-        with _shared_figures():
-            self._run(on_ready)
-
-    def _run(self, on_ready: Callable[[tuple[str, int]], None]) -> None:
-        sockets = server_sockets(self._config.listen, self._config.workers)
-        tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
-        for number, sock in enumerate(sockets):
-            tasks[worker_name(number)] = self._worker_task(number, sock)
-        if self._config.monitor is not None:
-            tasks[MONITOR] = self._monitor_task(self._config.monitor, list(tasks))
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, self._on_signal)
-        try:
-            for name, task in tasks.items():
-                self._start(name, task)
-            host, port = sockets[0].getsockname()[:2]
-            on_ready((host, port))
-            notify("READY=1")
-            while not self._stop.wait(WATCH):
-                if self._again.is_set():
-                    self._again.clear()
-                    self._read_again(tasks)
-                self._look(tasks, time.monotonic())
-                notify("WATCHDOG=1")
-        finally:
-            notify("STOPPING=1")
-            self._end(self._children)
-            for sock in sockets:
-                sock.close()
+        with metrics.shared(self._home.path):
+            sockets = server_sockets(self._config.listen, self._config.workers)
+            tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
+            for number, sock in enumerate(sockets):
+                tasks[worker_name(number)] = partial(self._work, number, sock)
+            if self._config.monitor is not None:  # a port that is taken is told now, before a robot is answered
+                tasks[MONITOR] = partial(self._watch, metrics.Web(self._config.monitor, list(tasks)))
+            for signaled in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+                signal.signal(signaled, self._on_signal)
+            try:
+                for name, task in tasks.items():
+                    self._start(name, task)
+                on_ready(sockets[0].getsockname()[:2])
+                notify("READY=1")
+                while not self._stop.wait(WATCH):
+                    if self._again.is_set():
+                        self._again.clear()
+                        self._read_again(tasks)
+                    self._look(tasks, time.monotonic())
+                    on_look()
+                    notify("WATCHDOG=1")
+            finally:
+                notify("STOPPING=1")
+                self._end(self._children)
+                for sock in sockets:
+                    sock.close()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGHUP and os.isatty(2) == self._at_terminal:
+        if number == signal.SIGHUP and os.isatty(0) == self._at_terminal:
             self._again.set()
-        else:
+        else:  # also of a terminal that is gone
             self.stop()
 
     def _read_again(self, tasks: dict[str, Callable[[], None]]) -> None:
@@ -235,8 +229,7 @@ class Supervisor:
         self._starts[name] += 1
         process = _FORK.Process(target=_child, args=(name, self._starts[name], task), name=name, daemon=False)
         process.start()
-        self._children[name] = process
-        self._started_at[name] = time.monotonic()
+        self._children[name], self._started_at[name] = process, time.monotonic()
         log.info("%s started, process %d", name, process.pid)
 
     def _look(self, tasks: dict[str, Callable[[], None]], now: float) -> None:
@@ -245,10 +238,8 @@ class Supervisor:
                 continue
             lived = now - self._started_at[name]
             pause = self._pause(name, process.exitcode, lived)
-            log.error(
-                "%s ended with exit code %s after %.0f s; it is started again in %.0f s",
-                name, process.exitcode, lived, pause,
-            )
+            log.error("%s ended with exit code %s after %.0f s; it is started again in %.0f s",
+                      name, process.exitcode, lived, pause)
             self._due[name] = now + pause
         for name, due in list(self._due.items()):
             if now >= due:
@@ -257,7 +248,7 @@ class Supervisor:
 
     def _pause(self, name: str, code: int | None, lived: float) -> float:
         """Seconds until it is started again. Raises ProcessError where that has no prospect."""
-        short = self._short_lives[name] = self._short_lives.get(name, 0) + 1 if lived < SHORT_LIFE else 0
+        short = self._short_lives[name] = self._short_lives[name] + 1 if lived < SHORT_LIFE else 0
         if name != MONITOR and short >= GIVE_UP_AFTER and code not in PATIENT:
             raise ProcessError(
                 f"{name} ends with exit code {code} as soon as it is started; the log says why."
@@ -277,41 +268,31 @@ class Supervisor:
                 process.kill()
                 process.join()
 
+    def _open_store(self) -> Inbox:
+        return open_store(self._config, self._home)
+
     # What runs in the children; each opens its own connections to store and chain.
 
-    def _worker_task(self, number: int, sock: Socket) -> Callable[[], None]:
-        def work() -> None:
-            from rosbridge_eth import metrics
+    def _work(self, number: int, sock: Socket) -> None:
+        reception = open_reception(
+            number, self._config, self._secrets.identity, self._home, Registry(self._home.registry),
+            self._open_store(), self._deployment,
+        )
+        worker, beats = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), Beats()
 
-            name, registry, inbox = worker_name(number), Registry(self._home.registry), self._open_store()
-            reception = open_reception(
-                number, self._config, self._secrets.identity, self._home, registry, inbox, self._deployment
-            )
-            worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
-            beats = Beats()
+        def show() -> None:
+            if beats.due():
+                metrics.show_worker(worker_name(number), worker, time.time())
 
-            def show() -> None:
-                if beats.due():
-                    metrics.show_worker(name, worker, time.time())
-
-            worker.run(_terminated(self._pid), on_turn=show)
-
-        return work
+        worker.run(_terminated(self._pid), on_turn=show)
 
     def _submit(self) -> None:
-        from rosbridge_eth import metrics
-
-        stopped = threading.Event()
-        asked = _terminated(self._pid)
-        ledger = Ledger.connect(self._config.chain.url, self._deployment)
+        asked, ledger = _terminated(self._pid), Ledger.connect(self._config.chain.url, self._deployment)
         registry, inbox = Registry(self._home.registry), self._open_store()
         submitter = open_submitter(self._config, ledger, inbox, registry, self._secrets.keys)
-        store = Trouble(log, "the store")
-        troubles = {
-            "trouble": Trouble(log, "the node"), "unconfirmed": Trouble(log, "confirmation"),
-            "funds": Trouble(log, "the treasury"),
-        }  # fmt: skip
-        beats = Beats()
+        subjects = {"trouble": "the node", "unconfirmed": "confirmation", "funds": "the treasury"}
+        troubles = {name: Trouble(log, subject) for name, subject in subjects.items()}
+        store, stopped, beats = Trouble(log, "the store"), threading.Event(), Beats()
         while not asked():
             registry.revision()  # StoreError where it was exchanged: this process ends, the next one opens it anew
             wait = FIRST_PAUSE
@@ -326,35 +307,13 @@ class Supervisor:
                 store.now(str(error))
             stopped.wait(min(wait, FIRST_PAUSE))
 
-    def _monitor_task(self, address: tuple[str, int], expected: list[str]) -> Callable[[], None]:
-        from rosbridge_eth.metrics import Web
-
-        # The port is opened here, so that one that is taken is told at the start, before a robot is answered.
-        web = Web(address, expected)
-
-        def watch() -> None:
-            web.start()
-            log.info("/metrics, /healthz and /readyz at http://%s:%d", *web.address)
-            stopped = _terminated(self._pid)
-            while not stopped():
-                time.sleep(WATCH)
-            web.stop()
-
-        return watch
-
-    def _open_store(self) -> Inbox:
-        return open_store(self._config, self._home)
-
-
-@contextmanager
-def _shared_figures() -> Iterator[None]:
-    """A folder for what the processes count, named where prometheus_client looks when it is first imported."""
-    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-", ignore_cleanup_errors=True) as folder:
-        os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder
-        try:
-            yield
-        finally:
-            del os.environ["PROMETHEUS_MULTIPROC_DIR"]
+    def _watch(self, web: metrics.Web) -> None:
+        web.start()
+        log.info("/metrics, /healthz and /readyz at http://%s:%d", *web.address)
+        stopped = _terminated(self._pid)
+        while not stopped():
+            time.sleep(WATCH)
+        web.stop()
 
 
 class Beats:
@@ -383,8 +342,6 @@ def _child(name: str, starts: int, task: Callable[[], None]) -> None:
     for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole group; the parent ends the children
         signal.signal(number, signal.SIG_IGN)
     try:
-        from rosbridge_eth import metrics
-
         metrics.STARTS.labels(name).set(starts)
         task()
     except BridgeError as error:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
-from collections.abc import Iterable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
+from rich.live import Live
 from rich.table import Table
 
 from rosbridge_eth.logs import LogFormat, speaks_json
@@ -59,6 +64,45 @@ def talk(text: str) -> None:
         log.warning("%s", text)
         return
     errors.print(text, markup=False)
+
+
+@contextmanager
+def live(make: Callable[[], RenderableType]) -> Iterator[Callable[[], None]]:
+    """At a terminal a picture that stays below all that is written to stderr, also by processes that are forked inside.
+    Gives what brings it up to date, once a second at most. Without a terminal there is nothing, and it does nothing.
+    """
+    if not errors.is_terminal or speaks_json():
+        yield lambda: None
+        return
+    ours, (end, begin), due = os.dup(2), os.pipe(), [0.0]
+    errors.file = os.fdopen(ours, "w")
+    os.dup2(begin, 2)
+    os.close(begin)
+
+    def pass_on() -> None:
+        with os.fdopen(end, errors="replace") as lines:
+            for line in lines:
+                with suppress(OSError):  # the terminal is gone
+                    errors.print(line.rstrip("\n"), markup=False)
+
+    def show() -> None:
+        if time.monotonic() >= due[0]:
+            due[0] = time.monotonic() + 1.0
+            with suppress(OSError):
+                shown.update(make(), refresh=True)
+
+    thread = threading.Thread(target=pass_on, name="stderr", daemon=True)
+    thread.start()
+    shown = Live(console=errors, auto_refresh=False, redirect_stdout=False, redirect_stderr=False)
+    shown.start()
+    try:
+        yield show
+    finally:
+        os.dup2(ours, 2)  # and the thread comes to its end
+        thread.join(1.0)
+        with suppress(OSError):
+            shown.stop()
+        errors.file = sys.stderr
 
 
 def print_json(value: Any) -> None:

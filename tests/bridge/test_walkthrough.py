@@ -14,8 +14,54 @@ from pathlib import Path
 
 import pytest
 
+from bridge.terminal import Terminal
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "walkthrough.md"
+
+
+@pytest.mark.service
+@pytest.mark.slow
+def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, require: Callable[[str], str]) -> None:
+    """Typed at terminals, with nothing given beforehand; what they ask for is answered."""
+    require("npx")
+    found = re.search(r"^```sh four\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    assert found
+    commands = [line.removeprefix("rosbridge-eth ").split() for line in found[1].splitlines()]
+    assert [words[0] for words in commands] == ["up", "join", "register", "robot"]
+    with Terminal(tmp_path, *commands[0]) as up:
+        up.answer("A passphrase for all of it: ", "open sesame")
+        up.answer("(again): ", "open sesame")
+        up.until("Listening on UDP")
+        with Terminal(tmp_path, *commands[1]) as join:
+            join.answer("Name of this robot", "")
+            join.answer("Messages come from", "sim")
+            join.answer("Which, by number, name or pattern", "2")
+            join.answer("Password for the keys of robot_1: ", "word")
+            join.answer("(again): ", "word")
+            join.until("rosbridge-eth register robot_1 robot/request.json")
+            assert join.end() == 0 and "/robot_1/imu" in join.shown
+        assert 'topics = ["/robot_1/odom"]' in (tmp_path / "robot" / "robot.toml").read_text()
+        with Terminal(tmp_path, *commands[2]) as register:
+            register.answer("Operator passphrase: ", "open sesame")
+            shown = register.until("rosbridge-eth robot")
+            assert register.end() == 0 and "registered in block" in shown
+        with Terminal(tmp_path, *commands[3]) as robot:
+            robot.answer("Password of robot_1: ", "word")
+            robot.until("first record is in block ")
+            assert robot.interrupt() == 0
+            fingerprint = re.compile(r"CA is ((?:[0-9a-f]{4} ){15}[0-9a-f]{4})")
+            assert fingerprint.findall(robot.shown) == fingerprint.findall(shown)
+        with Terminal(tmp_path, "read", "robot_1", "--topic", "/robot_1/odom") as read:
+            read.answer("Passphrase of the reader: ", "open sesame")
+            read.until('"source":"sim"')
+            assert read.end() == 0, read.shown[-1000:]
+        assert up.interrupt() == 0, up.shown[-1000:]
+    with Terminal(tmp_path, "up") as up:  # goes on with what is there
+        up.answer("Operator passphrase: ", "open sesame")
+        assert "The contract is" not in up.until("Listening on UDP")
+        assert up.interrupt() == 0
+    assert "Traceback" not in up.shown + robot.shown
 
 
 @pytest.mark.service
@@ -57,3 +103,4 @@ def test_the_walkthrough_runs_as_it_is_written(tmp_path: Path, require: Callable
     assert "revoked" in out and "Traceback" not in err
     fingerprints = re.findall(r"CA is ((?:[0-9a-f]{4} ){15}[0-9a-f]{4})", err)
     assert len(fingerprints) == 2 and len(set(fingerprints)) == 1, "what is to be compared"
+    assert "nav_msgs/msg/Odometry" in out and "MB a day" in err

@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import json as jsonlib
+import shutil
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import typer
 
-from rosbridge_eth.config import load_server_config
+from rosbridge_eth import terminal
+from rosbridge_eth.config import ServerConfig, load_server_config
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
-from rosbridge_eth.home import OperatorHome, ReaderHome
+from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Role, load_ca
 from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
-from rosbridge_eth.terminal import (
-    OPERATOR_HOME,
-    READER_HOME,
-    AnyHomeOption,
-    Json,
-    LogFormatOption,
-    OperatorHomeOption,
-    PassphraseFile,
-    PasswordFile,
-    Verbose,
-    print_json,
-    talk,
-    utc_now,
-)
+from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
 if TYPE_CHECKING:
     from rosbridge_eth.identity import CertificateAuthority
@@ -47,6 +37,7 @@ _CompromisedOption = Annotated[
 
 
 def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth up; rosbridge-eth up --chain http://127.0.0.1:8545")(up)
     app.command(epilog="Example: rosbridge-eth init --chain http://127.0.0.1:8545")(init)
     app.command(epilog="Example: rosbridge-eth chain --port 8545")(chain)
     app.command(epilog="Example: rosbridge-eth deploy --wait 60")(deploy)
@@ -85,6 +76,58 @@ def ledger_of(home: OperatorHome, *, check: bool = True) -> Iterator[Ledger]:
         yield ledger
     finally:
         ledger.close()
+
+
+def up(
+    home: OperatorHomeOption = OPERATOR_HOME,
+    reader: Annotated[Path, typer.Option(help="Folder for the first reader, `owner`.")] = READER_HOME,
+    chain: Annotated[str | None, typer.Option(help="A node of yours; without it, an anvil kept in the home.")] = None,
+    listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
+    public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
+    passphrase_file: PassphraseFile = None,
+    verbose: terminal.Verbose = 0,
+    log_format: terminal.LogFormatOption = LogFormat.TEXT,
+) -> None:
+    """Everything an operator runs, in one: home, local chain, contract, server. For trying out and for small sites.
+
+    What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
+    """
+    from rosbridge_eth.administration import deploy_contract, init_home
+    from rosbridge_eth.ledger import Keyring
+    from rosbridge_eth.ledger.nodes import Anvil, free_port, is_free
+
+    log_to_stderr(log_format, verbose)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    place, new = OperatorHome(home), not (home / "home.json").exists()
+    if new:
+        passphrase = read_passphrase("operator", "A passphrase for all of it", file=passphrase_file, confirm=True)
+        init_home(
+            place, passphrase, reader=ReaderHome(reader), reader_passphrase=passphrase, now=utc_now(), listen=listen,
+            public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}", passphrase_file=passphrase_file,
+        )
+        talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
+    config = load_server_config(place.require().config)
+    if not new:
+        passphrase = passphrase_of(place, passphrase_file)
+    if chain not in (None, config.chain.url):
+        raise ConfigError(f"{place.config} names another node; change [chain] url there")
+    node, state, deployed = urlsplit(config.chain.url), home / "chain.json", place.deployment_file.exists()
+    port = node.port if chain is None and node.hostname == "127.0.0.1" and (state.exists() or not deployed) else None
+    with ExitStack() as stack:
+        if port is not None and is_free(port):
+            anvil = stack.enter_context(Anvil.start(port, state=state))
+            anvil.fund(place.account, 1000)
+            talk(f"A local chain answers at {anvil.url}, kept in {state}.")
+        if not deployed:
+            made = deploy_contract(place, config.chain.url, Keyring.load(place.accounts, passphrase))
+            talk(f"The contract is {made.contract} on chain {made.chain_id}.")
+        where = "" if home == OPERATOR_HOME else f" --home {home}"
+        talk("On a robot:    rosbridge-eth join")
+        talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
+        talk("On the robot:  rosbridge-eth robot")
+        _serve(place, config, passphrase)
+    talk("Everything is kept: `up` goes on with it.")
 
 
 def init(
@@ -171,7 +214,7 @@ def register(
     compromised: _CompromisedOption = False,
     passphrase_file: PassphraseFile = None,
     ca_passphrase_file: _CaPassphraseFile = None,
-    password_file: PasswordFile = None,
+    password_file: terminal.PasswordFile = None,
 ) -> None:
     """Register a robot: its request becomes an account on the chain, certificates, and a bundle to carry back.
 
@@ -204,7 +247,16 @@ def register(
     if made.buried:
         talk(f"{made.buried} chunks of the old {name} are dead letters now; `status` lists them.")
     talk(f"The CA is {grouped(ca.certificate.fingerprint().hex())}.")
-    talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
+    if asked is None:
+        talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
+        return
+    assert request is not None  # noqa: S101 - it is where `asked` comes from
+    try:
+        shutil.copy(made.bundle, RobotHome(request.parent).answer)  # where the request lies in the robot's home
+        where = "" if request.parent == terminal.ROBOT_HOME else f" --home {request.parent}"
+        talk(f"Run there now: rosbridge-eth robot{where}")
+    except (OSError, ConfigError):
+        talk(f"Carry {made.bundle} into the robot's home and run there: rosbridge-eth robot")
 
 
 def _read(path: Path) -> bytes:
@@ -317,7 +369,7 @@ def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: Passphra
 
 def backup(
     target: Annotated[Path, typer.Argument(help="A new folder.")],
-    home: AnyHomeOption = OPERATOR_HOME,
+    home: terminal.AnyHomeOption = OPERATOR_HOME,
 ) -> None:
     """Copy a home, in use or not, into a new folder; keep it where its keys are safe."""
     from rosbridge_eth import administration
@@ -327,7 +379,7 @@ def backup(
 
 
 def passwd(
-    home: AnyHomeOption = OPERATOR_HOME,
+    home: terminal.AnyHomeOption = OPERATOR_HOME,
     passphrase_file: PassphraseFile = None,
     new_passphrase_file: Annotated[Path | None, typer.Option(help="The new one, on the first line.")] = None,
 ) -> None:
@@ -344,26 +396,31 @@ def server(
     home: OperatorHomeOption = OPERATOR_HOME,
     workers: Annotated[int | None, typer.Option(min=1, max=64, help="Processes that share the port.")] = None,
     passphrase_file: PassphraseFile = None,
-    verbose: Verbose = 0,
-    log_format: LogFormatOption = LogFormat.TEXT,
+    verbose: terminal.Verbose = 0,
+    log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:
     """Take chunks from robots and bring them onto the chain, until stopped."""
-    from rosbridge_eth.administration import load_server_identity
-    from rosbridge_eth.ledger import Keyring
-    from rosbridge_eth.supervisor import Secrets, Supervisor
-
     log_to_stderr(log_format, verbose)
     place = OperatorHome(home).require()
     config = load_server_config(place.config)
     if workers is not None:
         config = config.model_copy(update={"workers": workers})
-    passphrase = passphrase_of(place, passphrase_file)
+    _serve(place, config, passphrase_of(place, passphrase_file))
+
+
+def _serve(place: OperatorHome, config: ServerConfig, passphrase: bytes) -> None:
+    from rosbridge_eth.administration import load_server_identity
+    from rosbridge_eth.ledger import Keyring
+    from rosbridge_eth.status import fleet
+    from rosbridge_eth.supervisor import Secrets, Supervisor
+
     secrets = Secrets(load_server_identity(place, passphrase), Keyring.load(place.accounts, passphrase))
 
     def ready(address: tuple[str, int]) -> None:
         talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
 
-    Supervisor(place, config, secrets).run(ready)
+    with live(lambda: fleet(place)) as show:
+        Supervisor(place, config, secrets).run(ready, show)
 
 
 def check(
@@ -371,7 +428,7 @@ def check(
     stream: Annotated[str, typer.Argument(help="The chunk's stream: 32 hex digits, as `read` shows it.")],
     number: Annotated[int, typer.Argument(min=0, help="The chunk's number in the stream.")],
     home: OperatorHomeOption = OPERATOR_HOME,
-    json: Json = False,
+    json: terminal.Json = False,
 ) -> None:
     """Where is this chunk? Asks the inbox and the chain, and of one in a block the contract itself (checkData)."""
     from rosbridge_eth.status import locate
@@ -380,7 +437,7 @@ def check(
     with ledger_of(place) as ledger:
         found = locate(place, ledger, robot, stream, number)
     if json:
-        print_json(found._asdict())
+        terminal.print_json(found._asdict())
     else:
         where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
         said = "" if found.proven is None else f"; the contract says {str(found.proven).lower()}"

@@ -3,59 +3,118 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import sys
 import threading
 import time
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Group, RenderableType
+from rich.text import Text
 
 from rosbridge_eth import bundle as bundles
-from rosbridge_eth.config import load_robot_config
-from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.home import RobotHome
+from rosbridge_eth import terminal
+from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
+from rosbridge_eth.errors import ConfigError, StoreError
+from rosbridge_eth.home import RobotHome, require_empty
+from rosbridge_eth.identity import check_name
 from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.terminal import ROBOT_HOME, LogFormatOption, PasswordFile, RobotHomeOption, Verbose, talk
+from rosbridge_eth.sources import Offer
+from rosbridge_eth.terminal import errors, live, table, talk
+from rosbridge_eth.topics import ANYTHING, SourceOption, everything, offered, robot_toml
 
-SOURCES = {
-    "bag": "a bag",
-    "ros1": "the live ROS 1 graph",
-    "ros2": "the live ROS 2 graph",
-    "sim": "a SIMULATED robot",
-}
+if TYPE_CHECKING:
+    from rosbridge_eth.metrics import Rates
+    from rosbridge_eth.robot import Robot
+
+SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
+PLUMBING = {"/rosout", "/rosout_agg", "/parameter_events", "/clock"}
+"""Topics of ROS itself; they are taken only where they are named."""
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth join --name robot_1; later: rosbridge-eth join robot_1.bundle")(join)
+    app.command(epilog="Example: rosbridge-eth join --name robot_1 --source ros1 --topic /odom")(join)
     app.command(epilog="Example: rosbridge-eth robot --home robot --verbose")(robot)
 
 
 def join(
-    bundle: Annotated[Path | None, typer.Argument(help="The bundle that `register` wrote.")] = None,
+    bundle: Annotated[Path | None, typer.Argument(help="A bundle that holds the robot's keys (easy_register).")] = None,
     name: Annotated[str | None, typer.Option(help="Make keys here, and the request for `register`.")] = None,
-    home: RobotHomeOption = ROBOT_HOME,
-    password_file: PasswordFile = None,
+    home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
+    source: SourceOption = None,
+    topic: Annotated[list[str] | None, typer.Option(help="Topics, by name or pattern; else you are asked.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: all topics of the ROS that is there.")] = False,
+    password_file: terminal.PasswordFile = None,
 ) -> None:
-    """Make this machine a robot: first with --name, then with the bundle that the operator answers with.
+    """Make this machine a robot: its keys, its topics, and the request that the operator's `register` answers.
 
-    A bundle of `register` without a request holds the robot's keys and is all there is to join with.
+    The answer is a bundle: put it into the robot's home, where `robot` takes it up. A bundle of `register` without a
+    request holds the robot's keys and is all there is to join with.
     """
     place = RobotHome(home)
-    if (bundle is None) == (name is None):
-        raise typer.BadParameter("give --name to make keys and a request, or the bundle that answers it")
-    if name is not None:
-        password = read_passphrase("robot", f"Password for the keys of {name}", file=password_file, confirm=True)
-        bundles.ask_to_join(place, name, password)
-        talk(f"{home} has the keys of {name}; they never leave it.")
-        talk(f"Carry {place.request} to the operator, who runs: rosbridge-eth register {name} {place.request.name}")
+    if bundle is not None and name is None:
+        _join_with(bundle, place, password_file)
         return
-    assert bundle is not None  # noqa: S101 - one of the two is given
+    if bundle is not None or (name is None and not sys.stdin.isatty()):
+        raise typer.BadParameter("give --name to make keys and a request, or a bundle that holds the keys")
+    if name is None:
+        name = str(typer.prompt("Name of this robot", default="robot_1", err=True))
+    check_name(name)
+    require_empty(home)
+    config = _first_config(place, source, topic or [], asks=sys.stdin.isatty() and not yes, yes=yes)
+    password = read_passphrase("robot", f"Password for the keys of {name}", file=password_file, confirm=True)
+    bundles.ask_to_join(place, name, password, config)
+    talk(f"{home} has the keys of {name}; they never leave it. {place.config} says what it sends.")
+    talk(f"The operator runs now: rosbridge-eth register {name} {place.request}")
+
+
+def _first_config(place: RobotHome, source: str | None, topics: list[str], *, asks: bool, yes: bool) -> str:
+    """A robot.toml of what is given, found and chosen."""
+    if not (asks or yes or source or topics):
+        return bundles.FIRST_CONFIG
+    try:
+        found = str(ANYTHING.source_and_why(os.environ)[0].kind)
+    except ConfigError:
+        if source is None and not asks:
+            raise
+        found = "sim"
+    if source is None:
+        asked = "Messages come from (ros1, ros2, sim, a ROS 1 master's URI, or a bag)"
+        source = str(typer.prompt(asked, default=found, err=True)) if asks else found
+    config = parse_config(RobotConfig, robot_toml(topics or ["**"], source), place.config)
+    if not topics:
+        with closing(everything(config)) as opened:
+            offers = offered(opened)
+        topics = sorted({offer.topic for offer in offers} - PLUMBING)
+        if asks:
+            topics = _choose(offers, topics)
+    if not topics:
+        raise ConfigError(f"{source} offers no topics now: name them with --topic, or start what publishes them")
+    return robot_toml(topics, source)
+
+
+def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
+    numbered = {str(number): offer for number, offer in enumerate(offers, 1)}
+    rows = [(number, offer.topic, offer.type_name) for number, offer in numbered.items()]
+    errors.print(table("Topics", ["", "topic", "type"], rows, right=[0]))
+    given = str(typer.prompt("Which, by number, name or pattern", default="all", err=True))
+    if given == "all":
+        return suggested
+    words = re.split("[ ,]+", given.strip())
+    return list(dict.fromkeys(numbered[word].topic if word in numbered else word for word in words))
+
+
+def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> None:
     try:
         content = bundle.read_bytes()
     except OSError as error:
@@ -63,17 +122,20 @@ def join(
     sealed = bundles.needs_password(content)
     secret = read_passphrase("robot", "Registration password", file=password_file) if sealed else None
     opened = bundles.read_bundle(content, secret)
-    fingerprint = bundles.join(place, opened, secret)
+    _say_who(bundles.join(place, opened, secret))
+    talk(f"{place.path} is now the home of {opened.end.robot}. Name its topics in {place.config}, then run `robot`.")
+
+
+def _say_who(fingerprint: str) -> None:
     talk(f"The operator's CA is {grouped(fingerprint)}; compare it with what `register` showed.")
-    talk(f"{home} is now the home of {opened.end.robot}. Name its topics in {place.config}, then run `robot`.")
 
 
 def robot(
-    home: RobotHomeOption = ROBOT_HOME,
+    home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
     config: Annotated[Path | None, typer.Option(help="Use this file instead of robot.toml.")] = None,
-    password_file: PasswordFile = None,
-    verbose: Verbose = 0,
-    log_format: LogFormatOption = LogFormat.TEXT,
+    password_file: terminal.PasswordFile = None,
+    verbose: terminal.Verbose = 0,
+    log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:
     """Watch the configured topics and bring what they say to the server, until stopped or the source ends.
 
@@ -85,41 +147,84 @@ def robot(
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
+    if fingerprint := bundles.take_up(place):
+        _say_who(fingerprint)
     end = place.bridge()
     file = config or place.config
     settings = load_robot_config(file)
     source, why = settings.source_and_why(os.environ)
     talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
-    running = open_robot(place, settings, read_passphrase("robot", f"Password of {end.robot}", file=password_file))
-
-    again, terminal = threading.Event(), os.isatty(2)
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGHUP and os.isatty(2) == terminal:
-            again.set()
-        else:  # also of a terminal that is gone
-            running.stop()
-
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, on_signal)
-    beats = Beats()
-
-    def on_turn() -> None:
-        nonlocal settings
-        if again.is_set():
-            again.clear()
-            settings = read_again(running, place, settings, file)
-        if beats.due():
-            notify("WATCHDOG=1")
-            metrics.show_robot(end.robot, running, time.time())
-
+    password = read_passphrase("robot", f"Password of {end.robot}", file=password_file)
+    again, at_terminal = threading.Event(), os.isatty(0)
     with ExitStack() as stack:
+        stack.enter_context(metrics.shared(home))
+        running = open_robot(place, settings, password)
+
+        def on_signal(number: int, frame: FrameType | None) -> None:
+            if number == signal.SIGHUP and os.isatty(0) == at_terminal:
+                again.set()
+            else:  # also of a terminal that is gone
+                running.stop()
+
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, on_signal)
         if settings.monitor is not None:
             web = metrics.Web(settings.monitor, ["robot"])
             web.start()
             stack.callback(web.stop)
         talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
+        beats, rates, first = Beats(), metrics.Rates(), _first(running)
+        show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
+
+        def on_turn() -> None:
+            nonlocal settings
+            if again.is_set():
+                again.clear()
+                settings = read_again(running, place, settings, file)
+            with suppress(StoreError):  # which the robot itself tells
+                if beats.due():
+                    notify("WATCHDOG=1")
+                    first()
+                    metrics.show_robot(end.robot, running, time.time())
+                show()
+
         notify("READY=1")
         stack.callback(notify, "STOPPING=1")
         running.run(on_turn=on_turn)
     talk(running.summary)
+
+
+def _first(running: Robot) -> Callable[[], None]:
+    """What tells a person at the terminal, once, that the first record of this run is on the chain."""
+    told: list[int] = []
+
+    def tell() -> None:
+        newest = running.sender.statistics.newest
+        if errors.is_terminal and not told and newest is not None and newest.stream == running.writer.stream:
+            told.append(newest.block)
+            talk(f"The first record is in block {newest.block}{' or before' if newest.number else ''}.")
+
+    return tell
+
+
+def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
+    """What a person at the terminal sees: topics, chunks, session."""
+    now, lost = time.monotonic(), Counter[str]()
+    for (topic, _), count in running.source.lost.items():
+        lost[topic] += count
+    rows = [
+        (topic, f"{rates.of(topic, counted.captured, now):.1f}", counted.captured,
+         counted.refused + counted.undecodable + lost[topic])
+        for topic, counted in running.capture.statistics().items()
+    ]  # fmt: skip
+    spool, sender = running.spool.statistics(), running.sender.statistics
+    newest = sender.newest
+    where = f" (the last in block {newest.block})" if newest and newest.block else ""
+    session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
+    return Group(
+        table(name, ["topic", "records/s", "records", "lost"], rows, right=[1, 2, 3]),
+        Text(
+            f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
+            f" {spool.chunks - spool.unstored} for the chain, {sender.confirmed} confirmed{where}. Session: {session}."
+        ),
+    )

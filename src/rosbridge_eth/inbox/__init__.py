@@ -62,7 +62,8 @@ class Row(NamedTuple):
 class RobotState(NamedTuple):
     """What the submitter knows of a robot.
 
-    confirmed: stream and number of the newest row that is confirmed on the chain, and position: where it stands.
+    confirmed: stream and number of the newest row that is confirmed on the chain, and position: where it stands;
+    block: which has it, 0 where that is not known.
     hold: why nothing is written for the robot. certificates_hash: keccak256 of the certificates that the contract
     has for it. mark: a position that was confirmed at `marked_at`, for `forget`.
     """
@@ -73,6 +74,7 @@ class RobotState(NamedTuple):
     position: int | None = None
     mark: int | None = None
     marked_at: float = 0.0
+    block: int = 0
 
 
 class Waiting(NamedTuple):
@@ -179,8 +181,9 @@ class Inbox(Protocol):
         if state != known:
             self._save(tk, json.dumps(state, default=bytes.hex))
 
-    def confirm(self, tk: bytes, position: int | None, now: float) -> None:
-        """The row there and all before it are confirmed on the chain, and none behind it. It may move back.
+    def confirm(self, tk: bytes, position: int | None, now: float, block: int = 0) -> None:
+        """The row there, in this block, and all before it are confirmed on the chain, and none behind it. It may move
+        back.
 
         To be called at every look at the chain, also where nothing changed.
         """
@@ -191,7 +194,7 @@ class Inbox(Protocol):
             header = Chunk.parse(self.chunks(tk, [position])[0]).header
             kept = known.mark is not None and known.mark <= position
             self.set_state(
-                tk, confirmed=(header.stream, header.number), position=position,
+                tk, confirmed=(header.stream, header.number), position=position, block=block,
                 mark=known.mark if kept else position, marked_at=known.marked_at if kept else now,
             )  # fmt: skip
 

@@ -85,6 +85,22 @@ SAVE_SHARE = 20  # of the time at most so little is spent on saving
 TOLD_FROM = 256 * 2**20  # bytes of state that are worth a warning, and every doubling of it
 
 
+def is_free(port: int) -> bool:
+    """Whether a TCP port of 127.0.0.1 can be had."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+        return True
+
+
+def free_port(first: int) -> int:
+    """The first of `first` and those above that is free."""
+    return next(port for port in range(first, 65_536) if is_free(port))
+
+
 class Anvil:
     """A running anvil at `url`. Made by `start`; ends with `stop` or the `with` block.
 
@@ -116,18 +132,17 @@ class Anvil:
         its block at once. log_file: where its output goes (nowhere otherwise). ChainError if it is missing or does
         not start, or the port is taken.
         """
-        with socket.socket() as probe:  # otherwise whatever listens there would answer in anvil's place
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError as error:
-                raise ChainError(f"port {port} of 127.0.0.1 is in use ({error.strerror}); choose another") from error
+        if not is_free(port):  # whatever listens there would answer in anvil's place
+            raise ChainError(f"port {port} of 127.0.0.1 is in use; choose another")
         if shutil.which("anvil"):
             command = ["anvil"]
         elif shutil.which("npx"):
             command = ["npx", "--yes", f"@foundry-rs/anvil@{VERSION}"]
         else:
-            raise ChainError("a local chain needs anvil or, to fetch it, npx (of Node.js); install one of them")
+            raise ChainError(
+                "a local chain needs anvil (https://getfoundry.sh) or, to fetch it, npx (of Node.js): install one of"
+                " them, or use a node of yours (`up --chain URL`, or [chain] url in server.toml)"
+            )
         command += ["--host", "127.0.0.1", "--port", str(port), *options]
         if state is not None and state.exists():
             command += ["--load-state", str(state)]

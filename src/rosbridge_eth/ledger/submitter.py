@@ -148,6 +148,8 @@ class Submitter:
         self.funds: str | None = None  # why accounts are not topped up
         self.head: Block | None = None
         self.operator_balance: int | None = None  # the operator's, wei, a minute old at most
+        self.standings: Mapping[bytes, Standing] = {}  # at the last look
+        self.gas: Counter[bytes] = Counter()  # of the transactions sent for each robot, as offered
         self.counts: Counter[str] = Counter()
 
     @property
@@ -185,7 +187,7 @@ class Submitter:
         # Before the balances: what is in a block by now is in them, so nobody is topped up twice.
         [funds] = self._ledger.nonces([self._operator.address]) if self._operator else [(0, 0)]
         robots = list(self._robots())
-        standings = dict(zip(robots, self._ledger.standings(robots), strict=True))
+        self.standings = standings = dict(zip(robots, self._ledger.standings(robots), strict=True))
         self._confirm(standings, head, now)
         work = []
         for tk, standing in standings.items():
@@ -220,7 +222,7 @@ class Submitter:
         for tk, standing in zip(standings, then, strict=True):
             position = self._inbox.find(tk, standing.tail) if standing.chunks else None
             if position is not None or not standing.chunks:
-                self._inbox.confirm(tk, position, now)
+                self._inbox.confirm(tk, position, now, standing.data_block)
 
     def _place(self, tk: bytes, account: Account, standing: Standing, now: float) -> int | None:
         """The position of the row that is the chain's last chunk; None: there is none yet."""
@@ -386,6 +388,7 @@ class Submitter:
                 account.hold = "it used the gas of its day (gas_per_day); more comes by the hour"
                 break
             account.hold = None
+            self.gas[work.tk] += batch.gas
             new.append(batch)
             rest, first, front = rest[len(batch.rows) :], batch.end, batch.rows[-1].hash
         self.counts["sent"] += len(new)

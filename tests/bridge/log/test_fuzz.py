@@ -27,7 +27,7 @@ STREAM, DIGEST = bytes(range(16)), bytes(range(32))
 INPUTS = [
     CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, zstd.compress(b"one\ntwo\n") + bytes(20),
     zstd.compress(b"one\n" + b"a" * 70_000 + b"\n"), encode(Where(STREAM, 1, DIGEST)), encode(Offer(CHUNK.encoded)),
-    encode(Stored(STREAM, 1, DIGEST)), encode(Stored(STREAM, None, bytes(32))), encode(Confirmed(STREAM, 1)),
+    encode(Stored(STREAM, 1, DIGEST)), encode(Stored(STREAM, None, bytes(32))), encode(Confirmed(STREAM, 1, 2)),
     encode(Hold("why")), encode(Refused(STREAM, 1, "größer")),
 ]  # fmt: skip
 

@@ -29,7 +29,8 @@ reasons = st.text(max_size=100).filter(str.isprintable)
 ups = st.one_of(st.builds(Where, streams, numbers, digests), st.builds(Offer, st.binary(min_size=1, max_size=300)))
 downs = st.one_of(
     st.builds(Stored, streams, numbers, digests), st.builds(lambda s: Stored(s, None, bytes(32)), streams),
-    st.builds(Confirmed, streams, numbers), st.builds(Hold, reasons), st.builds(Refused, streams, numbers, reasons),
+    st.builds(Confirmed, streams, numbers, numbers), st.builds(Hold, reasons),
+    st.builds(Refused, streams, numbers, reasons),
 )  # fmt: skip
 
 
@@ -52,7 +53,7 @@ def test_any_bytes_are_a_message_or_a_protocol_error(data):
 
 
 @pytest.mark.parametrize(
-    "message", [Where(bytes(16), 1, bytes(32)), Stored(bytes(16), 1, bytes(32)), Confirmed(bytes(16), 1)]
+    "message", [Where(bytes(16), 1, bytes(32)), Stored(bytes(16), 1, bytes(32)), Confirmed(bytes(16), 1, 2)]
 )
 def test_a_message_that_is_cut_or_longer_is_none(message):
     data = encode(message)

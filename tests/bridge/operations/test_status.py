@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -71,7 +72,7 @@ def test_with_node_and_server_away_the_rest_is_shown_and_what_is_not_known_is_sa
     assert "chunks" not in robot and "connected" not in robot
     assert report["node"] is None and report["operator"]["eth"] is None
     said = " ".join(report["unknown"])
-    assert "127.0.0.1:9" in said and "monitor" in said
+    assert "127.0.0.1:9" in said and "the server does not run here" in said
     assert run(["status"]) == 0
     shown = capsys.readouterr()
     assert "robot_1" in shown.out and "not known" in shown.out and "127.0.0.1:9" in shown.err
@@ -141,7 +142,8 @@ def test_what_is_on_hold_or_dead_is_told_with_the_reason(place: Place, capsys: C
     assert report["robots"][robot_id("stranger").hex()]["waiting"]["chunks"] == 2
     assert run(["status"]) == 0
     shown = capsys.readouterr().out
-    assert "On hold, robot_1: the contract refuses." in shown and "3 chunks of robot_1: given up" in shown
+    assert "robot_1 is on hold: the contract refuses." in shown and "3 chunks of robot_1: given up" in shown
+    assert len(report["alarms"]) == 2
 
 
 def test_a_revoked_robot_is_shown_as_such(place: Place, capsys: Capture):
@@ -192,44 +194,61 @@ def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: P
 # Who is connected
 
 
-@pytest.fixture
-def monitored(place: Place) -> SimpleNamespace:
-    web = metrics.Web(("127.0.0.1", 0), ["worker-0"])
-    web.start()
-    place.configure("\n[chain]", f'monitor = "127.0.0.1:{web.address[1]}"\n[chain]')
-    yield SimpleNamespace(web=web)
-    web.stop()
-
-
-def test_who_is_connected_and_from_where_comes_from_the_monitor(
-    place: Place, monitored: SimpleNamespace, capsys: Capture
-):
+def test_who_is_connected_and_what_comes_from_them_is_what_the_running_server_shows(place: Place, capsys: Capture):
     now = time.time()
-    metrics.beat("worker-0", now)
-    metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
-    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
-    metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
-    report = status(capsys)
-    assert report["process"] == [] or all("runs" not in name for name in report["process"])
-    assert (report["robots"]["robot_1"]["connected"], report["robots"]["robot_1"]["address"]) == (True, "192.0.2.2")
-    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
-    robot = status(capsys)["robots"]["robot_1"]
-    assert robot["connected"] is False
-    metrics.CONDITION.labels("node answers").set(0)
-    assert "node answers" in status(capsys)["process"]
-    assert run(["status"]) == 0
-    assert "NOT READY: " in capsys.readouterr().out
-    metrics.CONDITION.labels("node answers").set(1)
+    with metrics.shared(place.operator.path):
+        metrics.beat("worker-0", now)
+        metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
+        metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
+        metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
+        metrics.RATE.labels("robot_1").set(12.5)
+        metrics.NEWEST.labels("robot_1").set(now - 30)
+        metrics.GAS.labels("robot_1").set(123_000)
+        report = status(capsys)
+        robot = report["robots"]["robot_1"]
+        assert (robot["connected"], robot["address"]) == (True, "192.0.2.2") and "robot_2" not in report["robots"]
+        assert (robot["rate"], robot["gas"]) == (12.5, 123_000) and 30 <= robot["newest"] < 60
+        assert "submitter runs" in report["process"], "it has not beaten"
+        metrics.beat("submitter", now)
+        metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
+        metrics.CONDITION.labels("node answers").set(0)
+        report = status(capsys)
+        assert report["robots"]["robot_1"]["connected"] is False
+        assert report["process"] == ["node answers"] and "node answers" in report["alarms"][0]
+        assert run(["status"]) == 0
+        shown = capsys.readouterr().out
+        assert "NOT READY: node answers" in shown and "12.5" in shown and "ALARM: " in shown
+        metrics.beat("worker-0", now - 60)
+        metrics.beat("submitter", now - 60)
+        report = status(capsys)
+        assert report["process"] is None and "rate" not in report["robots"]["robot_1"], "what was left by a killed one"
+    assert status(capsys)["process"] is None and not (place.operator.path / ".figures").is_symlink()
 
 
-@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b'{"conditions": []}', b"\xff", b'{"conditions": null}'])
-def test_a_monitor_that_answers_nonsense_is_one_that_does_not_answer(
-    place: Place, monkeypatch: Patch, answer: bytes, capsys: Capture
-):
-    place.configure("\n[chain]", 'monitor = "127.0.0.1:9"\n[chain]')
-    monkeypatch.setattr(module, "ask_monitor", lambda address, path: answer)
-    report = status(capsys)
-    assert report["process"] is None and any("does it run?" in line for line in report["unknown"])
+def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Place):
+    from rich.console import Console
+
+    screen = Console(width=100, record=True, file=io.StringIO())
+    with metrics.shared(place.operator.path):
+        for process in ("worker-0", "submitter"):
+            metrics.beat(process, time.time())
+        metrics.SESSION.labels("robot_1", "192.0.2.2").set(time.time())
+        metrics.WAITING.labels("robot_1").set(7)
+        metrics.OLDEST.labels("robot_1").set(300)
+        metrics.ON_CHAIN.labels("robot_1").set(41)
+        metrics.BLOCK.labels("robot_1").set(99)
+        metrics.HELD.labels("robot_1").set(1)
+        screen.print(module.fleet(place.operator))
+    shown = screen.export_text()
+    assert re.search(r"robot_1 .* 192\.0\.2\.2 .* 7 \(5m\) .* 41 \(99\)", shown), shown
+    assert "robot_1 is on hold" in shown and "has waited 5m" in shown
+
+
+def test_how_fast_a_count_grows_is_what_it_grew_by_in_the_last_ten_looks():
+    rates = metrics.Rates()
+    assert rates.of("a", 100, 0.0) == 0.0
+    assert [rates.of("a", 100 + 5 * second, second) for second in range(1, 30)] == [5.0] * 29
+    assert rates.of("a", 245, 30) == 4.5 and rates.of("b", 7, 30) == 0.0
 
 
 # A robot's and a reader's home
@@ -245,7 +264,7 @@ def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys:
             robot.spool.append(chunk)
         report = status(capsys, "--home", "robot")
         assert (report["kind"], report["robot"], report["runs"], report["spool"]) == ("robot", "robot_1", True, None)
-        assert any("monitor" in line for line in report["unknown"])
+        assert any("does not run here" in line for line in report["unknown"]), "it shows no figures"
     finally:
         robot.spool.close()
         robot.loop.close()
@@ -256,22 +275,18 @@ def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys:
     assert "/robot_1/odom" in shown and "192.0.2.1:7410" in shown and "3 chunks" in shown
 
 
-def test_a_running_robot_is_asked_by_its_monitor(place: Place, capsys: Capture):
-    web = metrics.Web(("127.0.0.1", 0), ["robot"])
-    web.start()
-    place.robot.config.write_text(
-        f'topics = ["/robot_1/odom"]\nmonitor = "127.0.0.1:{web.address[1]}"\n[source]\nkind = "sim"\n'
-    )
-    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
-    try:
-        metrics.show_robot("robot_1", robot, time.time())
-        report = status(capsys, "--home", "robot")
-        assert "robot has a session" in report["process"]
-        assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
-    finally:
-        robot.spool.close()
-        robot.loop.close()
-        web.stop()
+def test_a_running_robot_shows_its_figures(place: Place, capsys: Capture):
+    place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
+    with metrics.shared(place.robot.path):
+        robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+        try:
+            metrics.show_robot("robot_1", robot, time.time())
+            report = status(capsys, "--home", "robot")
+            assert "robot has a session" in report["process"]
+            assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
+        finally:
+            robot.spool.close()
+            robot.loop.close()
 
 
 def test_a_robot_without_its_bundle_is_told_what_is_next(place: Place, capsys: Capture):

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rosbridge_eth import metrics
@@ -123,11 +124,33 @@ def test_nothing_is_shown_before_somebody_has_said_it():
     assert samples == [], "a server that has no robot's figures rings no robot's alarm"
 
 
-def test_the_command_line_leaves_the_choice_of_the_figures_folder_to_the_server():
-    script = "import sys, rosbridge_eth.cli, rosbridge_eth.supervisor; print('prometheus_client' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
-                          env={**os.environ, "PYTHONPATH": str(Path(metrics.__file__).parents[1])})
-    assert done.stdout == "False\n"
+def test_a_home_leads_to_the_figures_while_it_runs_and_nothing_is_left_of_that(tmp_path: Path):
+    """A server in this very process must not change what is shown after it."""
+    metrics.CAPTURED.labels("before").set(1)
+    known = os.environ.get("PROMETHEUS_MULTIPROC_DIR")
+    with metrics.shared(tmp_path):
+        metrics.CAPTURED.labels("robot_1").set(7)
+        folder = (tmp_path / ".figures").resolve()
+        assert folder.stat().st_mode & 0o077 == 0
+        assert metrics.figures(tmp_path) == [("captured", {"robot": "robot_1"}, 7.0)]
+    assert not folder.exists() and not any(tmp_path.iterdir())
+    assert os.environ.get("PROMETHEUS_MULTIPROC_DIR") == known
+    assert metrics.collected() is metrics.REGISTRY
+    metrics.CAPTURED.labels("robot_1").set(8)
+    assert "rosbridge_eth_captured" in generate_latest(metrics.REGISTRY).decode()
+    with pytest.raises(ValueError):
+        metrics.figures(tmp_path)
+
+
+def test_what_a_killed_process_left_is_removed_and_a_home_that_takes_no_link_is_no_trouble(tmp_path: Path):
+    left = tmp_path / "rosbridge-eth-left"
+    left.mkdir()
+    (tmp_path / ".figures").symlink_to(left)
+    with metrics.shared(tmp_path):
+        assert not left.exists() and (tmp_path / ".figures").resolve().is_dir()
+    with metrics.shared(tmp_path / "absent"):
+        metrics.CAPTURED.labels("robot_1").set(7)
+        assert 'rosbridge_eth_captured{robot="robot_1"} 7.0' in generate_latest(metrics.collected()).decode()
 
 
 def test_processes_share_their_figures_by_a_folder(tmp_path: Path):
