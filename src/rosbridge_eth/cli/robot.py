@@ -210,13 +210,11 @@ def _first(running: Robot) -> Callable[[], None]:
 def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
     """What a person at the terminal sees: topics, chunks, session."""
     now, lost = time.monotonic(), Counter[str]()
-    for (topic, _), count in running.source.lost.items():
+    for (topic, _), count in [*running.source.lost.items(), *running.capture.lost.items()]:
         lost[topic] += count
-    rows = [
-        (topic, f"{rates.of(topic, counted.captured, now):.1f}", counted.captured,
-         counted.refused + counted.undecodable + lost[topic])
-        for topic, counted in running.capture.statistics().items()
-    ]  # fmt: skip
+    captured = {topic: count for (topic, what), count in running.capture.counts.items() if what == "captured"}
+    rows = [(topic, f"{rates.of(topic, captured.get(topic, 0), now):.1f}", captured.get(topic, 0), lost[topic])
+            for topic in sorted({*captured, *lost})]  # fmt: skip
     spool, sender = running.spool.statistics(), running.sender.statistics
     newest = sender.newest
     where = f" (the last in block {newest.block})" if newest and newest.block else ""
