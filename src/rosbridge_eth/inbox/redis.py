@@ -102,6 +102,7 @@ class RedisInbox(Inbox):
                 self.id, ledger = self._redis.eval(_script()[0], 1, self._prefix, *new)
             self._run_id = self._redis.info("server")["run_id"]
         if self.id is None:
+            self.check()
             raise NothingThere(f"there is no inbox in {self._place} yet")
         if ledger != self._ledger:
             raise StoreError(
