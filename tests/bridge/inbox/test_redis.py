@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+import shlex
 import shutil
 import socket
 import subprocess
@@ -419,9 +420,9 @@ def test_killed_and_started_again_under_load_it_loses_nothing_and_doubles_nothin
 
 
 def documented_acl() -> list[str]:
-    command = re.search(r"ACL SETUSER .*?(?=\n```)", HOWTO.read_text(encoding="utf-8"), re.DOTALL)
+    command = re.search(r"ACL SETUSER .*?(?=\nrosbridge-eth)", HOWTO.read_text(encoding="utf-8"), re.DOTALL)
     assert command is not None
-    return command.group().split()
+    return shlex.split(command.group().replace("\\\n", " "))
 
 
 def as_bridge(server: RedisServer, **more) -> RedisInbox:

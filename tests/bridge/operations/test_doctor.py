@@ -424,6 +424,9 @@ def test_a_redis_that_may_lose_chunks_or_gives_too_few_rights_is_broken(place: P
         assert of(findings, "store")["result"] == "ok" and "none yet" in of(findings, "store")["found"]
         with redis.client() as client:
             assert client.keys() == [], "doctor makes nothing"
+            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all", "-xtrim"])
+            assert "+xtrim" in json.dumps(of(doctor(capsys)[1], "store")), "rights are tried before there is an inbox"
+            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all"])
             place.inbox().close()
             assert of(doctor(capsys)[1], "store")["result"] == "ok"
             client.config_set("appendfsync", "everysec")
