@@ -42,11 +42,12 @@ _SETTINGS: Final = {
 COMMANDS: Final = {
     "eval": ("return 1", 0), "evalsha": ("0" * 40, 0), "config|get": ("appendonly",), "info": ("server",),
     "hset": ("K", "f", 1), "hget": ("K", "f"), "hmget": ("K", "f"), "hgetall": ("K",), "hincrby": ("K", "f", 1),
-    "hdel": ("K", "f"), "exists": ("K",), "set": ("K", 1), "get": ("K",), "del": ("K",),
+    "hdel": ("K", "f"), "exists": ("K",), "set": ("K", 1), "get": ("K",),
     "xadd": ("K", "*", "f", 1), "xdel": ("K", "1-1"), "xtrim": ("K", "MAXLEN", 1), "xrange": ("K", "-", "+"),
-    "xrevrange": ("K", "+", "-"),
+    "xrevrange": ("K", "+", "-"), "del": ("K",),
 }  # fmt: skip
-"""Every command that is used here and in the script, with arguments to try the right to it; K: a key of its own."""
+"""Every command that is used here and in the script, with arguments to try the right to it; K: a key of its own, which
+the last one removes."""
 _URL_PARTS: Final = frozenset({
     "connection_class", "db", "host", "password", "path", "port", "username",
     "ssl_ca_certs", "ssl_ca_path", "ssl_cert_reqs", "ssl_certfile", "ssl_check_hostname", "ssl_keyfile",
