@@ -8,8 +8,8 @@ sample that was run, and a judgement on each survivor.
     nice -n 10 python fuzz/mutate.py --sample 45 --seed 1 [--only sm3] [--report FILE]
 
 The sample is drawn with the seed from all changes that are possible in the module's files, so that a run can be
-repeated. Bounded by --sample, by --minutes, and for each mutant by three times the tests' own time. Needs what they
-need and nothing else; runs one process at a time, and leaves the working copy alone.
+repeated; one that --minutes cut short is a sample all the same. Needs what the tests need, and a shell that knows
+`ulimit -t`; runs one process at a time, and leaves the working copy alone.
 """
 
 from __future__ import annotations
@@ -85,6 +85,8 @@ SUITES: dict[str, dict[str, list[str]]] = {
 
 _SLOW = "memory_stays or at_the_edges or vectors_in_python or openssl_agrees"
 """Tests that take seconds, as an expression for pytest: they run only where all others passed."""
+_SECONDS = 120
+"""Of processor time for one run of tests, several times what any takes; a mutant may loop for ever."""
 
 _COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -223,29 +225,21 @@ def sample(module: str, count: int, seed: int) -> list[Mutant]:
     chosen = random.Random(f"{seed} {module}").sample(found, min(count, len(found)))  # noqa: S311 - a draw of tests
     return [
         Mutant(file, place.line, place.what, mutated((PACKAGE / file).read_text("utf-8"), place))
-        for file, place in sorted(chosen)
+        for file, place in chosen
     ]
 
 
-def run(package: Path, tests: list[str], timeout: float) -> bool:
-    """Do the tests pass against the copy in `package`? What takes too long counts as failed."""
+def run(package: Path, tests: list[str], chosen: str) -> bool:
+    """Do the tests pass against the copy in `package`? What takes too much of the processor counts as failed."""
     environment = os.environ | {
         "PYTHONPATH": f"{package.parent}{os.pathsep}{ROOT / 'tests'}", "PYTHONDONTWRITEBYTECODE": "1",
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # starting takes a third of the time
     }  # fmt: skip
-    end = time.monotonic() + timeout
-    for chosen in (f"not ({_SLOW})", _SLOW):
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "pytest_timeout", "-p", "no:cacheprovider", "-k", chosen,
-                   *(str(TESTS / name) for name in tests)]  # fmt: skip
-        try:
-            done = subprocess.run(  # noqa: S603 - pytest
-                command, cwd=ROOT, env=environment, capture_output=True, timeout=end - time.monotonic(), check=False,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            return False
-        if done.returncode not in (0, 5):  # 5: none of the tests was chosen
-            return False
-    return True
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "pytest_timeout", "-p", "no:cacheprovider",
+               "-k", chosen, *(str(TESTS / name) for name in tests)]  # fmt: skip
+    limited = ["sh", "-c", f'ulimit -t {_SECONDS}; exec "$@"', "sh", *command]
+    done = subprocess.run(limited, cwd=ROOT, env=environment, capture_output=True, check=False)  # noqa: S603 - pytest
+    return done.returncode in (0, 5)  # 5: none of the tests was chosen
 
 
 def main() -> int:
@@ -262,23 +256,22 @@ def main() -> int:
         shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
         for module in options.only or SUITES:
             killed = done = 0
-            times: dict[str, float] = {}
-            for mutant in sample(module, options.sample, options.seed):
+            mutants = sample(module, options.sample, options.seed)
+            needed = sorted({test for mutant in mutants for test in SUITES[module][mutant.file]})
+            if not run(package, needed, f"not ({_SLOW})"):
+                print(f"{module}: its tests fail without any change", file=sys.stderr)
+                return 2
+            for mutant in mutants:
                 if time.monotonic() > end:
                     print(f"{module}: stopped after {options.minutes:g} minutes")
                     break
                 tests = SUITES[module][mutant.file]
-                if mutant.file not in times:
-                    begin = time.monotonic()
-                    if not run(package, tests, 600):
-                        print(f"{mutant.file}: its tests fail without any change", file=sys.stderr)
-                        return 2
-                    times[mutant.file] = time.monotonic() - begin
                 original = (package / mutant.file).read_text("utf-8")
                 (package / mutant.file).write_text(mutant.source, "utf-8")
-                survived = run(package, tests, 30 + 3 * times[mutant.file])
+                survived = run(package, tests, f"not ({_SLOW})") and run(package, tests, _SLOW)
                 (package / mutant.file).write_text(original, "utf-8")
                 done, killed = done + 1, killed + (not survived)
+                print(f"{module} {done}", end="\r", file=sys.stderr, flush=True)
                 if survived:
                     line = (PACKAGE / mutant.file).read_text("utf-8").splitlines()[mutant.line - 1].strip()
                     survivors.append(f"{mutant.file}:{mutant.line}: {mutant.what}: {line}")

@@ -169,6 +169,11 @@ def test_a_request_under_another_uid() -> None:
         csr.verify(uid=bytes(8192))
 
 
+def test_alternative_names_take_all_that_prints() -> None:
+    names = ("email:a b@example.com", "URI:urn:~")  # the first and the last of printable ASCII
+    assert issue(subject_alt_names=names).subject_alt_names == names
+
+
 def test_nothing_asked_for_is_granted_unless_passed_on() -> None:
     assert issue().subject_alt_names == () and issue().extended_key_usage is None
     assert issue(subject_alt_names=CSR.subject_alt_names).subject_alt_names == CSR.subject_alt_names
@@ -278,7 +283,8 @@ EAST, WEST = timezone(timedelta(hours=8)), timezone(timedelta(hours=-5))
         ({"subject_alt_names": ("robot_1",)}, "is not 'URI:"),
         ({"subject_alt_names": ("host:robot_1",)}, "is not 'URI:"),
         ({"subject_alt_names": ("DNS:",)}, "empty"),
-        ({"subject_alt_names": ("DNS:a\0b",)}, "printable ASCII"),
+        ({"subject_alt_names": ("DNS:a\x1fb",)}, "printable ASCII"),
+        ({"subject_alt_names": ("DNS:a\x7fb",)}, "printable ASCII"),
         ({"subject_alt_names": ("URI:http://ü",)}, "printable ASCII"),
         ({"subject_alt_names": ("IP:1.2.3",)}, "not an IP address"),
         ({"subject_alt_names": ("dirName:robot",)}, "RFC 4514"),
