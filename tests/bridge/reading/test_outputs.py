@@ -8,12 +8,23 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy
 import pytest
 from matplotlib.image import imread
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from rosbridge_eth.capture import MessageLine, TypeLine, Wire, decoder_for_known, definition_line, parse_line
+from rosbridge_eth.capture import (
+    Capture,
+    MessageLine,
+    RawMessage,
+    TopicRule,
+    TypeLine,
+    Wire,
+    decoder_for_known,
+    definition_line,
+    parse_line,
+)
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.reading import outputs
 from rosbridge_eth.reading.outputs import BagSummary
@@ -196,6 +207,50 @@ def test_a_ros_2_record_becomes_a_ros_1_message(tmp_path):
     assert write_bag(tmp_path / "out.bag", [one]).whole == 1
     [(*_, message)] = messages(tmp_path / "out.bag")
     assert (message.header.seq, message.header.frame_id, message.point.z) == (0, "map", 3.0)
+
+
+def captured(wire: Wire, topic: str, type_name: str, *fields: Any) -> ProvenRecord:
+    """A message that a robot took in as it is configured by default: all fields, as far as they fit."""
+    decoder = decoder_for_known(wire, type_name)
+    assert decoder is not None
+    types = decoder.typestore.types
+    stamp = types["builtin_interfaces/msg/Time"](5, 6)
+    header = types["std_msgs/msg/Header"](*([7] if wire is Wire.ROS1 else []), stamp, "odom")
+    raw = decoder.encode(types[type_name](header, *fields))
+    found = Capture([TopicRule("**")], source_kind="ros").process(RawMessage(topic, type_name, T0, raw, decoder), T0)
+    assert found is not None
+    content, definition = parse_line(found.line), parse_line(definition_line(decoder))
+    assert isinstance(content, MessageLine) and isinstance(definition, TypeLine)
+    return ProvenRecord(PLACE, 0, found.line, content, definition)
+
+
+@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize("wire", Wire)
+def test_a_scan_and_an_odometry_come_back_whole_by_default_from_ros_1_and_ros_2_in_any_bag(tmp_path, name, wire):
+    ranges, covariance = numpy.linspace(0.1, 30, 360, dtype="f4"), numpy.arange(36) / 7
+    numbers = 0.0, 6.25, 0.5, 0.0, 0.25, 0.125, 30.0
+    scan = captured(wire, "/scan", "sensor_msgs/msg/LaserScan", *numbers, ranges, ranges / 2)
+    store = decoder_for_known(wire, "nav_msgs/msg/Odometry").typestore.types
+
+    def made(name: str, *fields: Any) -> Any:
+        return store[f"geometry_msgs/msg/{name}"](*fields)
+
+    pose = made("Pose", made("Point", 1.0, 2.0, 3.0), made("Quaternion", 0.0, 0.0, 0.0, 1.0))
+    twist = made("Twist", made("Vector3", 4.0, 5.0, 6.0), made("Vector3", 4.0, 5.0, 6.0))
+    odom = captured(wire, "/odom", "nav_msgs/msg/Odometry", "base",
+                    made("PoseWithCovariance", pose, covariance), made("TwistWithCovariance", twist, -covariance))  # fmt: skip
+    summary = write_bag(tmp_path / name, [scan, odom])
+    assert (summary.whole, summary.partial, summary.as_json, summary.notes) == (2, 0, 0, [])
+    found = {topic: message for topic, _, _, message in messages(tmp_path / name)}
+    assert found["/scan"].ranges.tolist() == ranges.tolist()
+    assert (found["/scan"].range_max, found["/scan"].intensities[359]) == (30.0, 15.0)
+    assert found["/odom"].pose.covariance.tolist() == covariance.tolist()
+    assert found["/odom"].twist.covariance.tolist() == (-covariance).tolist()
+    assert (found["/odom"].twist.twist.angular.z, found["/odom"].pose.pose.position.y) == (6.0, 2.0)
+    for message in found.values():
+        assert (message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id) == (5, 6, "odom")
+        assert hasattr(message.header, "seq") == (name == "out.bag")
+        assert getattr(message.header, "seq", 7 if wire is Wire.ROS1 else 0) == (7 if wire is Wire.ROS1 else 0)
 
 
 def test_two_definitions_of_one_name_stay_apart(tmp_path):
