@@ -5,16 +5,6 @@ from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Finding, Kind, Ve
 from rosbridge_eth.reading.verify import Choice, Place, ProvenChunk, ProvenRecord, Verifier
 
 __all__ = [
-    "Bookmark",
-    "Bookmarks",
-    "Choice",
-    "Finding",
-    "Kind",
-    "Place",
-    "ProvenChunk",
-    "ProvenRecord",
-    "Reading",
-    "Verdict",
-    "Verifier",
-    "read_robot",
-]
+    "Bookmark", "Bookmarks", "Choice", "Finding", "Kind", "Place", "ProvenChunk", "ProvenRecord",
+    "Reading", "Verdict", "Verifier", "read_robot",
+]  # fmt: skip

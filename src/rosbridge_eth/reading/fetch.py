@@ -61,17 +61,10 @@ class Reading:
 
 
 def read_robot(
-    ledgers: Sequence[Ledger],
-    name: str,
-    *,
-    trust: Trust,
-    reader: sm2.PrivateKey | None,
-    now: float,
-    bookmarks: Bookmarks | None = None,
-    cache: Path | None = None,
-    confirmations: int = 1,
+    ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
+    bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
     heartbeat: float = HEARTBEAT,
-) -> Reading:
+) -> Reading:  # fmt: skip
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
     ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next

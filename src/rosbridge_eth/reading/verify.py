@@ -17,17 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from eth_utils.crypto import keccak
 
 from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TypeLine, parse_line
-from rosbridge_eth.chunk import (
-    Chunk,
-    Header,
-    Log,
-    Malformed,
-    NoGrant,
-    Unopenable,
-    content_key,
-    open_lines,
-    robot_id,
-)
+from rosbridge_eth.chunk import Chunk, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import IdentityError, VerificationError
 from rosbridge_eth.identity import Role, Trust, split_certificates
@@ -117,6 +107,13 @@ class ProvenChunk:
     records: tuple[ProvenRecord, ...] = field(repr=False)
 
 
+class _Refused(Exception):
+    """A check ends a chunk, with this finding."""
+
+    def __init__(self, kind: Kind, detail: str = "", *, count: int = 1) -> None:
+        self.kind, self.detail, self.count = kind, detail, count
+
+
 class Verifier:
     """Reads one robot's log once: `read` gives what is proven, then `verdict` and `bookmark` say how it ended.
 
@@ -128,23 +125,11 @@ class Verifier:
     """
 
     def __init__(
-        self,
-        name: str,
-        ledger: bytes,
-        standing: Standing,
-        registrations: Sequence[RegistrationEvent],
-        *,
-        trust: Trust,
-        reader: sm2.PrivateKey | None,
-        block: int,
-        block_time: Callable[[int], int],
-        now: float,
-        mark: Bookmark | None = None,
-        at: Progress | None = None,
-        links: Links | None = None,
-        heartbeat: float = HEARTBEAT,
-        elsewhere: Sequence[bytes] = (),
-    ) -> None:
+        self, name: str, ledger: bytes, standing: Standing, registrations: Sequence[RegistrationEvent], *,
+        trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
+        mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
+        heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (),
+    ) -> None:  # fmt: skip
         self.name, self.log = name, Log(ledger, robot_id(name))
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
@@ -225,7 +210,11 @@ class Verifier:
                 if index < self._at.count:
                     continue
                 self._at.count, self._last = index + 1, encoded
-                proven = self._chunk(index, encoded, event)
+                proven = None
+                try:
+                    proven = self._chunk(index, encoded, event)
+                except _Refused as refused:
+                    self.findings.add(refused.kind, index, count=refused.count, detail=refused.detail)
                 if mark is not None and self._at.count == mark.count:
                     self._marked = True
                     if self._at.digest != mark.digest:
@@ -246,47 +235,39 @@ class Verifier:
             self.findings.add(Kind.WITHHELD, self._at.count, until - 1, count=until - self._at.count)
             self._at.count, self._last, self._at.tail = until, b"", ""
 
-    def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk | None:
+    def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
         signer = self._governing(index)
         try:
             chunk = Chunk.parse(encoded)
         except Malformed as error:
             self._at.digest = sm3.digest(encoded).hex()
-            self.findings.add(Kind.MALFORMED, index, detail=shown(str(error)))
-            return None
+            raise _Refused(Kind.MALFORMED, shown(str(error))) from None
         header = chunk.header
         self._at.digest = header.digest.hex()
         if signer is None or signer.key is None:
-            why = "no certificate is registered" if signer is None else signer.why
-            self.findings.add(Kind.UNTRUSTED, index, detail=why)
-            return None
+            raise _Refused(Kind.UNTRUSTED, "no certificate is registered" if signer is None else signer.why)
         if not is_signed(self.log, signer.key, chunk):
             elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
-            self.findings.add(Kind.ELSEWHERE if elsewhere else Kind.FORGED, index)
-            return None
+            raise _Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED)
         if header.sealed_ms > signer.ends_ms:
-            why = f"sealed after the certificate's end, {time_text(signer.ends_ms * 10**6)}"
-            self.findings.add(Kind.UNTRUSTED, index, detail=why)
-            return None
-        if not self._follow(index, header):
-            return None
+            end = time_text(signer.ends_ms * 10**6)
+            raise _Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
+        self._follow(index, header)
         self._check_clock(index, header, signer, event.block)
         self._at.head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
         if chunk.body and sm3.digest(chunk.body) != header.body_digest:
-            self.findings.add(Kind.ALTERED, index, detail="the body is not the one that the header names")
-            return None
+            raise _Refused(Kind.ALTERED, "the body is not the one that the header names")
         if chunk.dropped:
-            self.findings.add(Kind.DROPPED, index, count=header.records)
-            return None
+            raise _Refused(Kind.DROPPED, count=header.records)
         time = self._time(event.block)
         place = Place(index, header.stream, header.number, header.digest, event.block, time, event.transaction)
         return self._open(place, chunk)
 
     # --- links
 
-    def _follow(self, index: int, header: Header) -> bool:
-        """Tell where the chunk does not follow the newest one; False for one that was read already."""
+    def _follow(self, index: int, header: Header) -> None:
+        """Tell where the chunk does not follow the newest one; one that was read already is refused."""
         head = self._at.head
         follows = header.previous == (NO_DIGEST if head is None else bytes.fromhex(head.digest))
         same_stream = head is not None and header.stream.hex() == head.stream
@@ -297,15 +278,13 @@ class Verifier:
         # In an unbroken log nothing can be there twice; after a break, what follows may have been read before it.
         known = self.links.index_of(header.digest) if self._broken else None
         if known is not None:
-            self.findings.add(Kind.FORKED, index, detail=f"the chunk of index {known} once more")
-            return False
+            raise _Refused(Kind.FORKED, f"the chunk of index {known} once more")
         if breaks:
             self._tell_break(index, header, ahead, same_stream)
         if head is not None and not same_stream and (knows_none or not head.goodbye):
             detail = "it knows of nothing before: what it held is lost" if knows_none else ""
             self.findings.add(Kind.RESTARTED, index, detail=detail)
         self.links.add(header.digest, index)
-        return True
 
     def _tell_break(self, index: int, header: Header, ahead: int, same_stream: bool) -> None:
         """Forked where the robot wrote something else at this place or after what it follows; else missing."""
@@ -331,20 +310,19 @@ class Verifier:
 
     # --- content
 
-    def _open(self, place: Place, chunk: Chunk) -> ProvenChunk | None:
-        if not chunk.header.records:
+    def _open(self, place: Place, chunk: Chunk) -> ProvenChunk:
+        count = chunk.header.records
+        if not count:
             return ProvenChunk(place, chunk, b"", (), ())
+        if self._reader is None:
+            raise _Refused(Kind.NO_GRANT, count=count)
         try:
-            if self._reader is None:
-                raise NoGrant("there is no reader's key")
             key = content_key(chunk.header, self._reader)
             lines = open_lines(self.log, chunk, key)
         except NoGrant:
-            self.findings.add(Kind.NO_GRANT, place.chunk, count=chunk.header.records)
-            return None
+            raise _Refused(Kind.NO_GRANT, count=count) from None
         except Unopenable as error:
-            self.findings.add(Kind.UNOPENABLE, place.chunk, detail=shown(str(error)))
-            return None
+            raise _Refused(Kind.UNOPENABLE, shown(str(error))) from None
         records = tuple(self._parsed(place, lines))
         self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
@@ -379,19 +357,10 @@ class Verifier:
         head = self._at.head
         silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > self._heartbeat
         return Verdict(
-            robot=self.name,
-            sound=self.findings.sound,
-            chunks=self._standing.chunks,
-            block=self._block,
-            head=head,
-            records=self._at.records,
-            counts=dict(self.findings.counts),
-            certificates=tuple(self._signers),
-            silent=silent,
-            heartbeat=self._heartbeat,
-            findings=tuple(self.findings.kept),
-            nodes=tuple(nodes),
-        )
+            self.name, self.findings.sound, self._standing.chunks, self._block, head, self._at.records,
+            dict(self.findings.counts), tuple(self._signers), silent, self._heartbeat, tuple(self.findings.kept),
+            tuple(nodes),
+        )  # fmt: skip
 
     @property
     def honest(self) -> bool:

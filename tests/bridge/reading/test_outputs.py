@@ -237,8 +237,8 @@ def test_a_scan_and_an_odometry_come_back_whole_by_default_from_ros_1_and_ros_2_
 
     pose = made("Pose", made("Point", 1.0, 2.0, 3.0), made("Quaternion", 0.0, 0.0, 0.0, 1.0))
     twist = made("Twist", made("Vector3", 4.0, 5.0, 6.0), made("Vector3", 4.0, 5.0, 6.0))
-    odom = captured(wire, "/odom", "nav_msgs/msg/Odometry", "base",
-                    made("PoseWithCovariance", pose, covariance), made("TwistWithCovariance", twist, -covariance))  # fmt: skip
+    both = made("PoseWithCovariance", pose, covariance), made("TwistWithCovariance", twist, -covariance)
+    odom = captured(wire, "/odom", "nav_msgs/msg/Odometry", "base", *both)
     summary = write_bag(tmp_path / name, [scan, odom])
     assert (summary.whole, summary.partial, summary.as_json, summary.notes) == (2, 0, 0, [])
     found = {topic: message for topic, _, _, message in messages(tmp_path / name)}
