@@ -356,21 +356,18 @@ def _full_name(owner: str, name: str) -> str:
 
 def _md5_of_one(owner: str, lines: list[str], sums: Mapping[str, str]) -> str:
     constants, fields = [], []
-    for line in lines:
-        kind, *rest = line.partition("#")[0].split()
-        if any("=" in part for part in rest):
-            # In a string's value, "#" and spaces are part of the value.
-            declaration = line if kind == "string" else line.partition("#")[0]
-            name, _, value = declaration.partition(kind)[2].partition("=")
-            constants.append(f"{kind} {name.strip()}={value.strip()}")
-        elif not rest:
-            raise DefinitionError(f"a line in the definition of {owner} is not a field: {_shown(line)}")
+    for match in map(_LINE.fullmatch, lines):
+        if match is None:
+            raise DefinitionError(f"a line in the definition of {owner} is not a field")
+        kind, name = match["type"], match["name"]
+        if match["constant"]:  # in a string's value, "#" and spaces are part of the value
+            constants.append(f"{kind} {name}={match.string[match.end('constant') :].strip()}")
+        elif kind in _BASES or kind in ("time", "duration"):
+            fields.append(f"{kind}{match['array'] or ''} {name}")
+        elif (inner := sums.get(_full_name(owner, kind))) is not None:
+            fields.append(f"{inner} {name}")
         else:
-            bare = kind.partition("[")[0]
-            shown = kind if bare in _BASES or bare in ("time", "duration") else sums.get(_full_name(owner, bare))
-            if shown is None:
-                raise DefinitionError(f"the definition of {owner} refers to {_shown(bare)}, which is not ROS 1's")
-            fields.append(f"{shown} {rest[0]}")
+            raise DefinitionError(f"the definition of {owner} refers to {_shown(kind)}, which is not ROS 1's")
     return hashlib.md5("\n".join([*constants, *fields]).encode(), usedforsecurity=False).hexdigest()
 
 

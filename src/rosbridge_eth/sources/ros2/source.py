@@ -215,17 +215,14 @@ class Ros2Source(live.LiveSource):
         """A publisher has come that offers less than we ask for: look at once, not at the next turn."""
         self._look_now = True
 
-    def _own_type_hash(self, offer: Offer) -> str | None:
-        """The hash of the type as it is installed here, which our own subscription advertises."""
-        for endpoint in self._node.get_subscriptions_info_by_topic(offer.topic):
-            if parts.name_of(endpoint) == self._full_name and endpoint.topic_type == offer.type_name:
-                return parts.type_hash_of(endpoint)
-        return None
-
     def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
         """Who publishes the topic now, and who of them with another definition of its type."""
         if topic.type_hash is None:
-            topic.type_hash = self._own_type_hash(topic.offer)
+            # As it is installed here, which our own subscription advertises.
+            ours = self._node.get_subscriptions_info_by_topic(topic.offer.topic)
+            mine = (each for each in ours if parts.name_of(each) == self._full_name)
+            hashes = (parts.type_hash_of(each) for each in mine if each.topic_type == topic.offer.type_name)
+            topic.type_hash = next(hashes, None)
         present = {bytes(endpoint.endpoint_gid): endpoint for endpoint in publishers}
         topic.publishers = frozenset(present)
         known = (None, topic.type_hash)
