@@ -74,8 +74,9 @@ class Decoder:
         if len(raw) > self.max_raw:
             raise DecodeError(f"a {self.type_name} of {len(raw)} bytes is not decoded; at most {self.max_raw}")
         try:
-            decoded: object = getattr(self.typestore, f"deserialize_{self.wire}")(raw, self.type_name)
-            return decoded
+            if self.wire is Wire.ROS1:
+                return self.typestore.deserialize_ros1(raw, self.type_name)
+            return self.typestore.deserialize_cdr(raw, self.type_name)
         except SerdeError as error:
             raise DecodeError(str(error)) from error
 
