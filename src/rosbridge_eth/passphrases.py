@@ -39,8 +39,7 @@ def read_passphrase(
     Looked for in `file`, then where `passphrase_file` says, then asked for (twice with `confirm`). IdentityError
     where there is none to be had. configured: the file that server.toml names.
     """
-    file = file or passphrase_file(name, configured=configured, environment=environment)
-    if file is not None:
+    if file := file or passphrase_file(name, configured=configured, environment=environment):
         return _from_file(file)
     option = "--password-file" if name in _PASSWORDS or (name == "reader" and confirm) else "--passphrase-file"
     if not sys.stdin.isatty():

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 from eth_utils.crypto import keccak
 
@@ -39,8 +38,7 @@ CREATE UNIQUE INDEX IF NOT EXISTS in_force ON enrolment (role, name) WHERE revok
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Enrolment:
+class Enrolment(NamedTuple):
     """One identity the operator certified: a row as above, `account` for robots only."""
 
     number: int

@@ -11,8 +11,7 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias
 
 from rosbridge_eth.capture import Decoder, NamePattern, RawMessage
 from rosbridge_eth.errors import SourceError
@@ -21,8 +20,7 @@ Emit: TypeAlias = Callable[[RawMessage], None]
 """Takes a message; may block, which slows a bag or a simulation down (a live source drops instead)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(NamedTuple):
     """A topic that a source has, its type (pkg/msg/Name) and the nodes known to publish it, sorted."""
 
     topic: str

@@ -10,8 +10,7 @@ import math
 import random
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbridge_eth.capture import Decoder, RawMessage, Restoration, Wire, decoder_for_known
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Selection, Source
@@ -29,8 +28,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """Where the robot is and how it moves: metres, radians, seconds; heading in (-pi, pi]."""
 
     x: float = 0.0

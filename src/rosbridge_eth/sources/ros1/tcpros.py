@@ -12,8 +12,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
 from rosbridge_eth.capture import Decoder, DefinitionError, Wire, decoder_for, decoder_for_known, normalised_type_name
 from rosbridge_eth.sources.ros1.addressing import ProtocolError
@@ -34,8 +33,7 @@ _MD5 = re.compile(r"[0-9a-f]{32}")
 _PIECE: Final = 1 << 16
 
 
-@dataclass(frozen=True)
-class Publication:
+class Publication(NamedTuple):
     """What comes over one connection."""
 
     type_name: str
