@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,7 +55,9 @@ class Reading:
 
     def keep(self, bookmarks: Bookmarks, *, confirm: bool = False) -> None:
         """Write the bookmark. confirm: the reader has compared the fingerprints of new certificates."""
-        bookmark = self.verifier.bookmark(confirm=confirm)
+        bookmark, known = self.verifier.bookmark(confirm=confirm), bookmarks.get(self.verifier.log)
+        if bookmark is not None and known is not None and known.count > bookmark.count:
+            bookmark = replace(known, fingerprints=bookmark.fingerprints)
         if bookmark is not None:
             bookmarks.put(self.verifier.log, bookmark)
 
@@ -79,11 +81,14 @@ def read_robot(
             " lists the names there are"
         )
     log = Log(ledger.ledger, tk)
+    mark = None if bookmarks is None else bookmarks.get(log)
+    if mark is not None and confirmations > 1 and standing.chunks < mark.count <= ledger.standings([tk])[0].chunks:
+        mark = replace(mark, count=0)  # it is above the block that is asked for, and not taken back
     registrations = ledger.registrations(tk, standing)
     kept = None if cache is None or reader is None else _kept(cache, name, log, reader, trust, ledger, block, told)
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=None if bookmarks is None else bookmarks.get(log),
+        block_time=ledger.block_time, now=now, mark=mark,
         at=None if kept is None else kept.progress, links=None if kept is None else kept.links, heartbeat=heartbeat,
         elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log),
     )  # fmt: skip
@@ -106,7 +111,7 @@ def _kept(
     if kept.block <= block:
         told.append(f"the chain has another block {kept.block} than at the reading before: all of it was read anew")
         return kept.emptied()
-    told.append(f"node {shown(ledger.url)} has only {block} blocks of the {kept.block} that were read before")
+    told.append(f"what was read before reaches block {kept.block}, above block {block}: it was not used")
     kept.close()
     return None
 

@@ -197,7 +197,7 @@ def test_a_node_that_is_behind_is_read_as_it_is_and_nothing_is_lost(chain, tmp_p
     found, reading = read(behind, tmp_path, bookmarks=bookmarks)
     assert numbers(found) == list(range(16))
     assert reading.verdict().counts["rolled-back"] == 1
-    assert "only 10 blocks" in "\n".join(reading.verdict().lines())
+    assert "above block 10" in "\n".join(reading.verdict().lines())
     assert numbers(read(chain, tmp_path)[0]) == list(range(40))
     assert chain.asked == [1, 14]
 

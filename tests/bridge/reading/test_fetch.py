@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.reading import Bookmarks, Kind, Reading, read_robot
+from rosbridge_eth.reading.fetch import MARGIN
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")
 OPERATOR, ACCOUNT = KEYS.operator, KEYS.robot(1)
@@ -117,6 +118,20 @@ def test_confirmations_leave_the_newest_blocks_for_later(chain):
     assert reading.verdict().sound
 
 
+def test_more_confirmations_than_last_time_are_no_roll_back(chain, tmp_path):
+    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
+    for _ in range(4):
+        chain.write(chain.pen.chunks(1))
+    for confirmations, found in ((1, 4), (3, 2), (1, 4)):
+        reading = chain.read(confirmations=confirmations, bookmarks=bookmarks)
+        assert numbers(reading) == list(range(found))
+        assert reading.verdict().sound
+        reading.keep(bookmarks)
+        mark = bookmarks.get(chain.pen.log)
+        assert mark is not None
+        assert mark.count == 4, "what was seen once stays known"
+
+
 def test_a_name_that_nobody_has(chain):
     with pytest.raises(IdentityError, match="no robot of the name robot_9"):
         read_robot([chain.ledger], "robot_9", trust=Trust([]), reader=None, now=NOW)
@@ -203,3 +218,24 @@ def test_a_bookmark_is_not_moved_by_a_node_that_rolled_back(chain, tmp_path: Pat
     mark = Bookmarks(tmp_path / "bookmarks.json").get(chain.pen.log)
     assert mark is not None
     assert mark.count == 3
+
+
+def test_what_is_deep_in_a_real_chain_is_kept_and_the_rest_is_asked_for(chain, tmp_path, monkeypatch):
+    chain.write(chain.pen.chunks(3, records=5))
+    chain.where.ethereum_tester.mine_blocks(MARGIN)
+    chain.write(chain.pen.chunks(2, records=5))
+    asked: list[int] = []
+    real = Ledger.data_events
+
+    def data_events(self: Ledger, tk: bytes, first_block: int, last_block: int) -> Iterator[Any]:
+        asked.append(last_block - first_block)
+        return real(self, tk, first_block, last_block)
+
+    monkeypatch.setattr(Ledger, "data_events", data_events)
+    for _ in range(2):
+        reading = chain.read(cache=tmp_path / "proven")
+        assert numbers(reading) == list(range(25))
+        assert reading.verdict().sound
+        assert (reading.verdict().records, reading.verdict().chunks) == (25, 5)
+        reading.close()
+    assert asked[0] > MARGIN > asked[1]
