@@ -165,9 +165,6 @@ class Backlog:
         with self._changed:
             return dict(self._dropped)
 
-    def __len__(self) -> int:
-        return len(self._messages)
-
     def _drop_oldest(self, topic: str) -> None:
         self._pop(self._by_topic[topic][0])
         self._drop(topic)
