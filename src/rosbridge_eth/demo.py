@@ -11,12 +11,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -47,8 +47,7 @@ class Stages:
     times: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Transaction:
+class Transaction(NamedTuple):
     """A batch on the chain."""
 
     block: int
@@ -73,72 +72,54 @@ class DemoResult:
     @property
     def passed(self) -> bool:
         """Every captured record came back, proven, equal to the bag's, once, and the robot has said goodbye."""
-        head = self.verdict.head
-        return (
-            self.verdict.sound
-            and head is not None
-            and head.goodbye
-            and not self.comparison.differences
-            and self.stages.captured == self.comparison.equal == len(self.records) > 0
-        )
+        head, equal = self.verdict.head, self.comparison.equal
+        said = self.verdict.sound and head is not None and head.goodbye and not self.comparison.differences
+        return said and self.stages.captured == equal == len(self.records) > 0
 
 
-@dataclass(slots=True)
-class _Server:
-    """The server's parts, in two threads."""
+@contextmanager
+def _serving(worker: Worker, submitter: Submitter) -> Iterator[Callable[[], None]]:
+    """The server's parts, in two threads; gives what raises their failure in this one."""
+    stop, failures = threading.Event(), list[BaseException]()
 
-    worker: Worker
-    submitter: Submitter
-    stop: threading.Event = field(default_factory=threading.Event)
-    failures: list[BaseException] = field(default_factory=list)
-    threads: list[threading.Thread] = field(default_factory=list)
-
-    def start(self) -> None:
-        for name, task in (("worker", self._receive), ("submitter", self._submit)):
-            thread = threading.Thread(target=self._run, args=(task,), name=name, daemon=True)
-            self.threads.append(thread)
-            thread.start()
-
-    def _receive(self) -> None:
-        self.worker.run(self.stop.is_set)
-
-    def _submit(self) -> None:
-        while not self.stop.wait(min(0.05, self.submitter.turn(time.time()))):
+    def submit() -> None:
+        while not stop.wait(min(0.05, submitter.turn(time.time()))):
             continue
 
-    def _run(self, task: Callable[[], None]) -> None:
+    def run(task: Callable[[], None]) -> None:
         try:
             task()
-        except BaseException as error:  # kept and raised in the main thread, which waits for this one
-            self.failures.append(error)
-            self.stop.set()
+        except BaseException as error:
+            failures.append(error)
+            stop.set()
 
-    def check(self) -> None:
-        if self.failures:
-            raise self.failures[0]
+    def check() -> None:
+        if failures:
+            raise failures[0]
 
-    def end(self) -> None:
-        self.stop.set()
-        self.worker.loop.wake()
-        for thread in self.threads:
+    tasks = {"worker": lambda: worker.run(stop.is_set), "submitter": submit}
+    threads = [threading.Thread(target=run, args=(task,), name=name, daemon=True) for name, task in tasks.items()]
+    for thread in threads:
+        thread.start()
+    try:
+        yield check
+    finally:
+        stop.set()
+        worker.loop.wake()
+        for thread in threads:
             thread.join(10)
+    check()
 
 
 def run_demo(
-    folder: Path,
-    bag: Path,
-    *,
-    topics: Sequence[str] = (f"/{ROBOT}/odom",),
-    harm: Harm | None = None,
-    on_datagram: Callable[[bytes], None] = lambda data: None,
-    on_stage: Callable[[str], None] = lambda text: None,
-    on_progress: Callable[[Stages], None] = lambda stages: None,
-    on_turn: Callable[[Robot], None] = lambda robot: None,
-) -> DemoResult:
+    folder: Path, bag: Path, *, topics: Sequence[str] = (f"/{ROBOT}/odom",), harm: Harm | None = None,
+    on_datagram: Callable[[bytes], None] = lambda data: None, on_stage: Callable[[str], None] = lambda text: None,
+    on_progress: Callable[[Stages], None] = lambda stages: None, on_turn: Callable[[Robot], None] = lambda robot: None,
+) -> DemoResult:  # fmt: skip
     """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
 
     harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each
-    of them. on_turn: is given the robot at each turn of its loop.
+    of them. on_stage: is told what begins. on_turn: is given the robot at each turn of its loop.
     """
     from rosbridge_eth import administration
     from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
@@ -155,6 +136,7 @@ def run_demo(
     from rosbridge_eth.robot import open_robot
     from rosbridge_eth.server import Worker
     from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
+    from rosbridge_eth.topics import robot_toml
 
     started, stages = time.monotonic(), Stages()
     home, robot_home, reader_home = (
@@ -163,24 +145,26 @@ def run_demo(
     passphrase, password, reader_passphrase = (secrets.token_hex(16).encode() for _ in range(3))
     now = datetime.now(UTC)
 
-    on_stage("making keys and certificates")
-    with _timed(stages, "keys and certificates"):
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        on_stage(name)
+        began = time.perf_counter()
+        yield
+        stages.times[name] = time.perf_counter() - began
+
+    with stage("keys and certificates"):
         administration.init_home(
             home, passphrase, reader=reader_home, reader_passphrase=reader_passphrase, now=now, listen="127.0.0.1:0",
             public="127.0.0.1:7410",
         )
         keys = Keyring.load(home.accounts, passphrase)
         ask_to_join(robot_home, ROBOT, password)
-
-    on_stage("starting the embedded chain, deploying the contract")
-    with _timed(stages, "chain and contract"):
+    with stage("chain and contract"):
         chain = EmbeddedChain(fund={keys.operator.address: FUNDS})
         deployment = administration.deploy_contract(home, chain, keys)
         ledger = Ledger.connect(chain, deployment)
-
-    on_stage("registering the robot")
     config, registry = load_server_config(home.config), Registry(home.registry)
-    with _timed(stages, "registration"):
+    with stage("registration"):
         made = administration.register_robot(
             home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
             inbox=lambda: open_store(config, home), request=Request.decode(robot_home.request.read_bytes()),
@@ -188,50 +172,41 @@ def run_demo(
         join(robot_home, read_bundle(made.bundle.read_bytes()))
 
     [sock] = server_sockets(config.listen)
-    inbox = open_store(config, home)
-    reception = open_reception(
-        0, config, administration.load_server_identity(home, passphrase), home, registry, inbox, deployment
-    )
+    inbox, identity = open_store(config, home), administration.load_server_identity(home, passphrase)
+    reception = open_reception(0, config, identity, home, registry, inbox, deployment)
+    worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
     submitter = open_submitter(config, ledger, open_store(config, home), registry, keys)
-    server = _Server(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
-    relay = Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)
-    robot_home.config.write_text(robot_toml(topics, bag, relay.port))
-    robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
+    with closing(Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)) as relay:
+        # Short chunks, so that there are several.
+        more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
+        robot_home.config.write_text(f'server = "127.0.0.1:{relay.port}"\n{robot_toml(topics, str(bag))}{more}')
+        robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
 
-    def progress() -> None:
-        server.check()
-        stages.captured, stages.chunks = robot.captured, robot.chunks
-        stages.stored = reception.records[ROBOT]
-        on_progress(stages)
-        on_turn(robot)
+        with _serving(worker, submitter) as check:
 
-    on_stage("replaying the bag over UDP")
-    server.start()
-    try:
-        with _timed(stages, "replay and delivery"):
-            robot.run(on_turn=progress)
-        progress()
-        on_stage("waiting for the last block")
-        with _timed(stages, "last batches"):
-            deadline = time.monotonic() + SETTLE
-            while any(waiting.chunks for waiting in inbox.totals().values()):
-                server.check()
-                if time.monotonic() > deadline:
-                    raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
-                server.stop.wait(0.02)
-    finally:
-        server.end()
-        relay.close()
-    server.check()
+            def progress() -> None:
+                check()
+                stages.captured, stages.chunks = robot.captured, robot.chunks
+                stages.stored = reception.records[ROBOT]
+                on_progress(stages)
+                on_turn(robot)
 
-    on_stage("reading everything back from the chain")
-    with _timed(stages, "fetch, open and verify"):
+            with stage("replay and delivery over UDP"):
+                robot.run(on_turn=progress)
+            progress()
+            with stage("last batches"):
+                deadline = time.monotonic() + SETTLE
+                while any(waiting.chunks for waiting in inbox.totals().values()):
+                    check()
+                    if time.monotonic() > deadline:
+                        raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
+                    time.sleep(0.02)
+    with stage("fetch, open and verify"):
         reader, roots = load_identity(reader_home.path, reader_passphrase)
         reading = read_robot([ledger], ROBOT, trust=Trust(roots), reader=reader.encryption_key, now=time.time())
         records = tuple(reading.records())
         verdict = reading.verdict()
-    on_stage("comparing with the bag")
-    with _timed(stages, "comparison with the bag"):
+    with stage("comparison with the bag"):
         comparison = compare(bag, topics, [record.content for record in records])
     stages.verified = comparison.equal
     on_progress(stages)
@@ -243,15 +218,6 @@ def run_demo(
     )
 
 
-def robot_toml(topics: Sequence[str], bag: Path, port: int) -> str:
-    """The configuration of the demo's robot; its chunks are short, so that there are several."""
-    names = ", ".join(f'"{topic}"' for topic in topics)
-    return (
-        f'topics = [{names}]\nserver = "127.0.0.1:{port}"\n\n[log]\nperiod = "50ms"\n\n'
-        f'[source]\nkind = "bag"\npath = "{bag.resolve()}"\nspeed = "max"\n'
-    )
-
-
 def _transactions(ledger: Ledger, events: Iterable[DataEvent]) -> Iterator[Transaction]:
     for event in events:
         receipt = ledger.receipt(event.transaction)
@@ -259,14 +225,6 @@ def _transactions(ledger: Ledger, events: Iterable[DataEvent]) -> Iterator[Trans
             event.block, len(event.chunks), sum(map(len, event.chunks)), 0 if receipt is None else receipt.gas_used,
             "0x" + event.transaction.hex(),
         )
-
-
-@contextmanager
-def _timed(stages: Stages, name: str) -> Iterator[None]:
-    """Adds the seconds of a block to the stages' times."""
-    started = time.perf_counter()
-    yield
-    stages.times[name] = time.perf_counter() - started
 
 
 # The command
@@ -321,10 +279,10 @@ def demo(
         trajectory.write(record)
     drawn = trajectory.draw(report / "trajectory.png") > 0
     stages = result.stages
-    counts = [
-        ("records captured", stages.captured), ("chunks of the robot's log", stages.chunks),
-        ("lines stored by the server", stages.stored), ("records equal to the bag's", stages.verified),
-    ]  # fmt: skip
+    counts = list(zip(
+        ("records captured", "chunks of the robot's log", "lines stored by the server", "records equal to the bag's"),
+        (stages.captured, stages.chunks, stages.stored, stages.verified), strict=True,
+    ))  # fmt: skip
     times = [(name, f"{seconds * 1000:.0f} ms") for name, seconds in stages.times.items()]
     heads = ("block", "chunks", "bytes", "gas", "gas/record", "transaction")
     share = len(result.records) / max(1, sum(each.bytes for each in result.transactions))  # records a byte
@@ -373,13 +331,11 @@ def _html(
     """A page that needs nothing but its folder."""
 
     def rows(lines: Iterable[Sequence[object]], cell: str) -> str:
-        return "".join(
-            "<tr>" + "".join(f"<{cell}>{escape(str(value))}</{cell}>" for value in line) + "</tr>" for line in lines
-        )
+        cells = ("".join(f"<{cell}>{escape(str(value))}</{cell}>" for value in line) for line in lines)
+        return "".join(f"<tr>{line}</tr>" for line in cells)
 
-    verdict = "Every record came back, proven and equal to the bag's." if result.passed else (
-        "Not every record came back."
-    )  # fmt: skip
+    passed = "Every record came back, proven and equal to the bag's."
+    verdict = passed if result.passed else "Not every record came back."
     shown = "".join(
         f"<h2>{title}</h2><div class=wide><table>{rows([heads], 'th')}{rows(lines, 'td')}</table></div>"
         for title, heads, lines in tables

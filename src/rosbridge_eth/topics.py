@@ -3,7 +3,7 @@
 A live source is listened to for some seconds; a bag or a simulation is read as fast as it goes, for as long at most.
 The messages are captured, written and sealed as a robot does it, with keys that are thrown away: sizes are measured,
 only the way from there to a day is arithmetic. A topic's cost is that of its records alone, compressed; the headers of
-chunks and the transactions come once, with the total.
+chunks and the transactions come once, with the total. What was heard once costs nothing a day.
 """
 
 from __future__ import annotations
@@ -121,11 +121,11 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     took = time.monotonic() - began if source.live else (max(times) - min(times)) / 1e9 if times else 0.0
     selection, days = config.selection(), max(took, 1.0) / DAY
     chosen = [topic for topic in heard.values() if selection.wants(topic.offer)]
-    chunks = _sealed([line for topic in chosen for line in topic.lines], config, source.kind, readers)
+    chunks = _sealed([line for topic in chosen if topic.rate for line in topic.lines], config, source.kind, readers)
     sizes, alone = [len(chunk.encoded) for chunk in chunks], set_data_gas([])
     full = set_data_gas(sizes) - alone + alone * sum(sizes) / BATCH_BYTES
-    bodies = {name: sum(len(chunk.body) for chunk in _sealed(topic.lines, config, source.kind, readers))
-              for name, topic in heard.items()}  # fmt: skip
+    bodies = {name: sum(len(chunk.body) for chunk in _sealed(topic.lines if topic.rate else [], config, source.kind,
+                                                             readers)) for name, topic in heard.items()}  # fmt: skip
     return {
         "seconds": took,
         "topics": [
@@ -184,11 +184,11 @@ def topics(
     if json:
         print_json(report)
         return
-    columns = ["topic", "type", "Hz", "bytes", "taken", "MB a day", "Mgas a day"]
+    columns = ["topic", "type", "Hz", "bytes", "taken", "MB a day", "Ggas a day"]
     rows = [
         (each["topic"], each["type"], "" if each["rate"] is None else f"{each['rate']:.3g}",
          "" if each["size"] is None else f"{each['size']:.0f}", "yes" if each["chosen"] else "",
-         f"{each['bytes_per_day'] / 1e6:.3g}", f"{each['gas_per_day'] / 1e6:.3g}")
+         f"{each['bytes_per_day'] / 1e6:.3g}", f"{each['gas_per_day'] / 1e9:.3g}")
         for each in report["topics"]
     ]  # fmt: skip
     data.print(table(f"Topics, as heard in {report['seconds']:.0f} s", columns, rows, right=[2, 3, 5, 6]))
