@@ -207,10 +207,15 @@ def fleet(place: OperatorHome) -> RenderableType:
     """The picture of a running server at its terminal, from its own figures alone."""
     from rosbridge_eth.registry import Registry
 
-    with Registry(place.registry) as registry:
-        robots = [robot for robot in registry.robots().values() if robot.revoked_at is None]
-    report: Report = {"robots": {robot.name: {"in_force": True} for robot in robots}, "unknown": [], "dead": []}
-    _add_figures(report, _running(report, place.path, _server_processes(load_server_config(place.config)), "server"))
+    report: Report = {"robots": {}, "unknown": [], "dead": []}
+    try:
+        with Registry(place.registry) as registry:
+            report["robots"] = {robot.name: {"in_force": True} for robot in registry.robots().values()
+                                if robot.revoked_at is None}  # fmt: skip
+        processes = _server_processes(load_server_config(place.config))
+    except BridgeError as error:  # of a file that is changed at this moment
+        return Text(str(error))
+    _add_figures(report, _running(report, place.path, processes, "server"))
     return Group(_robots(report, money=False), *map(Text, _alarms(report)))
 
 

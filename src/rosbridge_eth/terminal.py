@@ -19,6 +19,7 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
 
+from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.logs import LogFormat, speaks_json
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 def utc_now() -> datetime:
     return datetime.now(UTC)
+
+
+def read_given(path: Path) -> bytes:
+    """A file that was named on the command line; ConfigError."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def talk(text: str) -> None:

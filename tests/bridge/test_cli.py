@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +16,8 @@ import pytest
 from bridge.operations.conftest import Place, _made, place
 from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.home import OperatorHome
+from rosbridge_eth.ledger.nodes import Anvil, free_port
 from rosbridge_eth.sources import sample_bag
 
 __all__ = ["_made", "place"]  # fixtures
@@ -87,7 +90,7 @@ def test_a_home_of_another_kind_is_told(capsys: Capture) -> None:
 
 
 def test_a_wrong_passphrase_is_told(capsys: Capture) -> None:
-    fails(capsys, ExitCode.IDENTITY, "wrong password", "server", "--passphrase-file", "wrong")
+    fails(capsys, ExitCode.IDENTITY, "password is wrong", "server", "--passphrase-file", "wrong")
     fails(capsys, ExitCode.IDENTITY, "", "mnemonic", "--passphrase-file", "wrong")
     fails(capsys, ExitCode.IDENTITY, "", "read", "robot_1", "--passphrase-file", "wrong")
     Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "sim"\n')
@@ -202,6 +205,54 @@ def test_a_port_in_use_and_another_chain_are_told(place: Place, require: Callabl
             taken.bind(("127.0.0.1", 0))
             place.configure("127.0.0.1:0", f"127.0.0.1:{taken.getsockname()[1]}")
             fails(capsys, ExitCode.NETWORK, "port", "server", *OPERATOR)
+
+
+def test_up_says_what_it_lacks_and_goes_on_when_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("pass").write_text("word")
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    error = fails(capsys, ExitCode.CHAIN, "npx", "up", *OPERATOR)
+    assert "--chain URL" in error and "getfoundry" in error
+    assert Path("operator/home.json").exists() and Path("reader/home.json").exists()
+    account = OperatorHome(Path("operator")).account
+    fails(capsys, ExitCode.CHAIN, "npx", "up", *OPERATOR)
+    assert OperatorHome(Path("operator")).account == account, "what is there is used"
+    fails(capsys, ExitCode.CONFIG, "another node", "up", "--chain", "http://127.0.0.1:9", *OPERATOR)
+    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "up", "--home", "other", "--reader", "others", "--chain",
+          "http://127.0.0.1:9", *OPERATOR)
+
+
+@pytest.mark.service
+def test_up_takes_a_given_node_and_shows_no_picture_where_there_is_no_terminal(
+    tmp_path: Path, require: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    require("npx")
+    monkeypatch.chdir(tmp_path)
+    Path("pass").write_text("word")
+    given = ("up", "--passphrase-file", "pass", "--listen", "127.0.0.1:0", "--public", "192.0.2.1:7410", "--chain")
+    with Anvil.start(free_port(18545)) as anvil:
+        account = re.search(r"0x[0-9a-fA-F]{40}", fails(capsys, ExitCode.CHAIN, "1 ETH", *given, anvil.url))
+        assert account
+        anvil.fund(account[0], 10)
+        up = subprocess.Popen([sys.executable, "-m", "rosbridge_eth", *given, anvil.url], stdin=subprocess.DEVNULL,
+                              stderr=subprocess.PIPE, text=True)  # fmt: skip
+        try:
+            assert up.stderr is not None
+            said = ""
+            while "Listening on UDP" not in said:
+                line = up.stderr.readline()
+                assert line, said
+                said += line
+            assert run(["status", "--json"]) == 0
+            time.sleep(1.5)  # in which a picture would be drawn
+        finally:
+            up.terminate()
+        said += up.communicate(timeout=30)[1]
+    assert up.returncode == 0, said
+    assert "join" in said and "register NAME REQUEST" in said and "\x1b" not in said and "session" not in said
+    assert not Path("operator/chain.json").exists(), "the node is somebody else's"
 
 
 def test_the_passphrase_may_be_named_by_the_configuration_or_the_environment(

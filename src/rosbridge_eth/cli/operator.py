@@ -6,7 +6,7 @@ import json as jsonlib
 import shutil
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import typer
 
 from rosbridge_eth import terminal
-from rosbridge_eth.config import ServerConfig, load_server_config
+from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Role, load_ca
@@ -24,7 +24,8 @@ from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOptio
 
 if TYPE_CHECKING:
     from rosbridge_eth.identity import CertificateAuthority
-    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.inbox import Inbox
+    from rosbridge_eth.ledger import Keyring, Ledger
 
 _CaPassphraseFile = Annotated[
     Path | None, typer.Option(help="Of a CA kept apart, where it has a passphrase of its own.")
@@ -64,18 +65,30 @@ def _ca(home: OperatorHome, passphrase: bytes, file: Path | None) -> Certificate
     return load_ca(home.ca, own, utc_now())
 
 
+def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring]:
+    """An operator's home, its passphrase and its accounts."""
+    from rosbridge_eth.ledger import Keyring
+
+    place = OperatorHome(home).require()
+    passphrase = passphrase_of(place, file)
+    return place, passphrase, Keyring.load(place.accounts, passphrase)
+
+
+def _inbox(place: OperatorHome) -> Inbox:
+    from rosbridge_eth.supervisor import open_store
+
+    return open_store(load_server_config(place.config), place)
+
+
 @contextmanager
 def ledger_of(home: OperatorHome, *, check: bool = True) -> Iterator[Ledger]:
     """The contract on the configured node; ChainError unless it is there, which is not asked without `check`."""
     from rosbridge_eth.ledger import Ledger
 
-    ledger = Ledger.connect(load_server_config(home.config).chain.url, home.deployment())
-    try:
+    with closing(Ledger.connect(load_server_config(home.config).chain.url, home.deployment())) as ledger:
         if check:
             ledger.check()
         yield ledger
-    finally:
-        ledger.close()
 
 
 def up(
@@ -93,26 +106,26 @@ def up(
     What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
     """
     from rosbridge_eth.administration import deploy_contract, init_home
-    from rosbridge_eth.ledger import Keyring
     from rosbridge_eth.ledger.nodes import Anvil, free_port, is_free
 
     log_to_stderr(log_format, verbose)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
-    place, new = OperatorHome(home), not (home / "home.json").exists()
-    if new:
-        passphrase = read_passphrase("operator", "A passphrase for all of it", file=passphrase_file, confirm=True)
-        init_home(
-            place, passphrase, reader=ReaderHome(reader), reader_passphrase=passphrase, now=utc_now(), listen=listen,
-            public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}", passphrase_file=passphrase_file,
+    if not (home / "home.json").exists():
+        secret = read_passphrase("operator", "A passphrase for all of it", file=passphrase_file, confirm=True)
+        keys = init_home(
+            OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
+            listen=listen, public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
+            passphrase_file=passphrase_file,
         )
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
-    config = load_server_config(place.require().config)
-    if not new:
-        passphrase = passphrase_of(place, passphrase_file)
-    if chain not in (None, config.chain.url):
+        place = OperatorHome(home)
+    else:
+        place, secret, keys = _opened(home, passphrase_file)
+    url, state = load_server_config(place.config).chain.url, home / "chain.json"
+    if chain not in (None, url):
         raise ConfigError(f"{place.config} names another node; change [chain] url there")
-    node, state, deployed = urlsplit(config.chain.url), home / "chain.json", place.deployment_file.exists()
+    node, deployed = urlsplit(url), place.deployment_file.exists()
     port = node.port if chain is None and node.hostname == "127.0.0.1" and (state.exists() or not deployed) else None
     with ExitStack() as stack:
         if port is not None and is_free(port):
@@ -120,13 +133,13 @@ def up(
             anvil.fund(place.account, 1000)
             talk(f"A local chain answers at {anvil.url}, kept in {state}.")
         if not deployed:
-            made = deploy_contract(place, config.chain.url, Keyring.load(place.accounts, passphrase))
+            made = deploy_contract(place, url, keys)
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
         where = "" if home == OPERATOR_HOME else f" --home {home}"
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
-        _serve(place, config, passphrase)
+        _serve(place, secret, keys, {})
     talk("Everything is kept: `up` goes on with it.")
 
 
@@ -197,10 +210,8 @@ def deploy(
 ) -> None:
     """Create the contract on the configured chain."""
     from rosbridge_eth.administration import deploy_contract
-    from rosbridge_eth.ledger import Keyring
 
-    place = OperatorHome(home).require()
-    keys = Keyring.load(place.accounts, passphrase_of(place, passphrase_file))
+    place, _, keys = _opened(home, passphrase_file)
     made = deploy_contract(place, load_server_config(place.config).chain.url, keys, wait=wait)
     talk(f"The contract is {made.contract} on chain {made.chain_id}.")
     talk("Next: `join --name NAME` on a robot, then here `register NAME REQUEST`.")
@@ -222,22 +233,18 @@ def register(
     """
     from rosbridge_eth.administration import register_robot
     from rosbridge_eth.bundle import Request
-    from rosbridge_eth.ledger import Keyring
     from rosbridge_eth.reading.verdict import grouped
-    from rosbridge_eth.supervisor import open_store
 
-    place = OperatorHome(home).require()
-    asked = None if request is None else Request.decode(_read(request))
-    passphrase = passphrase_of(place, passphrase_file)
-    password = None
-    if asked is None:
-        password = read_passphrase("robot", f"Registration password of {name}", file=password_file, confirm=True)
+    asked = None if request is None else Request.decode(terminal.read_given(request))
+    place, passphrase, keys = _opened(home, passphrase_file)
+    secret = None if asked else read_passphrase(
+        "robot", f"Registration password of {name}", file=password_file, confirm=True
+    )  # fmt: skip
     ca = _ca(place, passphrase, ca_passphrase_file)
     with ledger_of(place) as ledger:
         made = register_robot(
-            place, name, ca=ca, keys=Keyring.load(place.accounts, passphrase), ledger=ledger,
-            inbox=lambda: open_store(load_server_config(place.config), place), now=utc_now(), request=asked,
-            password=password, replace=replace, compromised=compromised,
+            place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place), now=utc_now(), request=asked,
+            password=secret, replace=replace, compromised=compromised,
         )  # fmt: skip
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if not made.own_keys:
@@ -247,23 +254,15 @@ def register(
     if made.buried:
         talk(f"{made.buried} chunks of the old {name} are dead letters now; `status` lists them.")
     talk(f"The CA is {grouped(ca.certificate.fingerprint().hex())}.")
-    if asked is None:
+    if request is None:
         talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
         return
-    assert request is not None  # noqa: S101 - it is where `asked` comes from
     try:
         shutil.copy(made.bundle, RobotHome(request.parent).answer)  # where the request lies in the robot's home
         where = "" if request.parent == terminal.ROBOT_HOME else f" --home {request.parent}"
         talk(f"Run there now: rosbridge-eth robot{where}")
     except (OSError, ConfigError):
         talk(f"Carry {made.bundle} into the robot's home and run there: rosbridge-eth robot")
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def add_reader(
@@ -297,16 +296,13 @@ def revoke(
 ) -> None:
     """Revoke a name: the server closes its session at once, and the chain takes nothing from it any more."""
     from rosbridge_eth import administration
-    from rosbridge_eth.ledger import Keyring
-    from rosbridge_eth.supervisor import open_store
 
-    place = OperatorHome(home).require()
-    keys = Keyring.load(place.accounts, passphrase_of(place, passphrase_file))
+    place, _, keys = _opened(home, passphrase_file)
     with ledger_of(place, check=False) as ledger:  # the server is told even where the node is away
         ended = administration.revoke(
             place, role, name, keys=keys, ledger=ledger, now=utc_now(), compromised=compromised,
-            inbox=lambda: open_store(load_server_config(place.config), place),
-        )
+            inbox=lambda: _inbox(place),
+        )  # fmt: skip
     talk(f"{role} {name} is revoked" + (f", on the chain in block {ended.block}." if ended.block is not None else "."))
     if ended.buried:
         talk(f"{ended.buried} chunks that {name} had handed over are not on the chain; they are dead letters now.")
@@ -337,11 +333,9 @@ def export(
     """Write an account as a standard keystore that other Ethereum software imports."""
     from rosbridge_eth.administration import OPERATOR
     from rosbridge_eth.files import write_atomically
-    from rosbridge_eth.ledger import Keyring
     from rosbridge_eth.registry import Registry
 
-    place, number = OperatorHome(home).require(), 0
-    keys = Keyring.load(place.accounts, passphrase_of(place, passphrase_file))
+    (place, _, keys), number = _opened(home, passphrase_file), 0
     if name != OPERATOR:
         with Registry(place.registry) as registry:
             robot = registry.find(Role.ROBOT, name)
@@ -358,10 +352,7 @@ def export(
 
 def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
     """Print the words from which all accounts can be restored (`init --mnemonic-file`). Keep them offline."""
-    from rosbridge_eth.ledger import Keyring
-
-    place = OperatorHome(home).require()
-    words = Keyring.load(place.accounts, passphrase_of(place, passphrase_file)).mnemonic
+    words = _opened(home, passphrase_file)[2].mnemonic
     if words is None:
         raise IdentityError("the accounts of this home come from a seed, not from words")
     typer.echo(words)
@@ -401,20 +392,17 @@ def server(
 ) -> None:
     """Take chunks from robots and bring them onto the chain, until stopped."""
     log_to_stderr(log_format, verbose)
-    place = OperatorHome(home).require()
-    config = load_server_config(place.config)
-    if workers is not None:
-        config = config.model_copy(update={"workers": workers})
-    _serve(place, config, passphrase_of(place, passphrase_file))
+    _serve(*_opened(home, passphrase_file), {} if workers is None else {"workers": workers})
 
 
-def _serve(place: OperatorHome, config: ServerConfig, passphrase: bytes) -> None:
+def _serve(place: OperatorHome, passphrase: bytes, keys: Keyring, changes: dict[str, int]) -> None:
+    """Run the server, with these keys of server.toml changed."""
     from rosbridge_eth.administration import load_server_identity
-    from rosbridge_eth.ledger import Keyring
     from rosbridge_eth.status import fleet
     from rosbridge_eth.supervisor import Secrets, Supervisor
 
-    secrets = Secrets(load_server_identity(place, passphrase), Keyring.load(place.accounts, passphrase))
+    config = load_server_config(place.config).model_copy(update=changes)
+    secrets = Secrets(load_server_identity(place, passphrase), keys)
 
     def ready(address: tuple[str, int]) -> None:
         talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")

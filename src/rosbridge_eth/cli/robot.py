@@ -115,10 +115,7 @@ def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
 
 
 def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> None:
-    try:
-        content = bundle.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{bundle} cannot be read: {error.strerror}") from error
+    content = terminal.read_given(bundle)
     sealed = bundles.needs_password(content)
     secret = read_passphrase("robot", "Registration password", file=password_file) if sealed else None
     opened = bundles.read_bundle(content, secret)
