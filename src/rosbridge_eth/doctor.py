@@ -14,12 +14,10 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeAlias
 
 import typer
 
@@ -49,27 +47,14 @@ OLD_HEAD, DEAD_HEAD = 3600.0, 12 * 3600.0  # seconds since the last block
 ANYWHERE = ("0.0.0.0", "::")  # noqa: S104 - what is looked for
 
 
-def ask_monitor(address: tuple[str, int], path: str) -> bytes:
-    """What a monitor answers. OSError, HTTPException."""
-    # 0.0.0.0 is where a monitor may listen; it answers on the loopback.
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address[0], address[0])  # noqa: S104 - not bound here
-    with closing(http.client.HTTPConnection(host, address[1], timeout=ANSWER_TIME)) as connection:
-        connection.request("GET", path)
-        return connection.getresponse().read()
+class Finding(NamedTuple):
+    """One thing that was tried: what was found, and the mend where something is to be done.
 
+    result: "ok"; "note": it works, and will not for ever or not at its best; "broken"; "skipped": it could not be
+    tried, and `mend` says what it takes.
+    """
 
-class Result(StrEnum):
-    OK = "ok"
-    NOTE = "note"  # works, and will not for ever or not at its best
-    BROKEN = "broken"
-    SKIPPED = "skipped"  # could not be tried; `mend` says what it takes
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was tried: what was found, and the mend where something is to be done."""
-
-    result: Result
+    result: str
     what: str
     found: str
     mend: str = ""
@@ -78,7 +63,7 @@ class Finding:
 Findings: TypeAlias = Iterator[Finding]
 Check: TypeAlias = Callable[[Path, bytes | None], Findings]
 """A check is given the home and, where there is one, the passphrase of its keys."""
-ok, note, broken, skipped = (partial(Finding, result) for result in Result)
+ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note", "broken", "skipped"))
 
 
 def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Findings:
@@ -112,9 +97,8 @@ def clock(home: Path, secret: bytes | None) -> Findings:
 def files(home: Path, secret: bytes | None) -> Findings:
     mode = stat.S_IMODE(home.stat().st_mode)
     if mode & 0o077:
-        result = broken if mode & 0o022 else note
-        yield result("home", f"others may {'write to' if mode & 0o022 else 'look into'} {home} (mode {mode:04o})",
-                     f"chmod 700 {home}")
+        result, may = (broken, "write to") if mode & 0o022 else (note, "look into")
+        yield result("home", f"others may {may} {home} (mode {mode:04o})", f"chmod 700 {home}")
     elif not os.access(home, os.W_OK):
         yield broken("home", f"{home} is not writable for this user", "run as the user the service runs as")
     else:
@@ -154,50 +138,58 @@ def certificates(folder: Path, renewal: str) -> Findings:
                 yield ok("certificates", f"{path.name} of {folder.name} until {each.not_after:%Y-%m-%d}")
 
 
+def near(address: Address) -> Address:
+    """Where a socket of this machine that listens there is reached from here."""
+    return address._replace(host={"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address.host, address.host))  # noqa: S104
+
+
 def monitor(address: Address | None, runs: bool) -> Findings:
     """Is the port of /metrics free, or does the process that should have it answer there?"""
     if address is None:
         return
     conditions: dict[str, bool] = {}
+    taken = None
     with socket.socket(socket.AF_INET6 if ":" in address.host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(tuple(address))
-            taken = False
         except OSError as error:
-            taken, why = True, error.strerror
-    with suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError):
-        conditions = dict(jsonlib.loads(ask_monitor(address, "/readyz"))["conditions"]) if taken and runs else {}
+            taken = error.strerror
+    if taken and runs:
+        with (
+            suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError),
+            closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection,
+        ):
+            connection.request("GET", "/readyz")
+            conditions = dict(jsonlib.loads(connection.getresponse().read())["conditions"])
     failing = [name for name, holds in conditions.items() if not holds]
     if failing:
         yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
     elif conditions or not (taken or runs):
         yield ok("monitor", f"{address} " + ("says ready" if conditions else "is free"))
     else:
-        reason = f" ({why})" if taken else ""
-        yield broken("monitor port", f"{address} is not answered by this home's process{reason}",
+        yield broken("monitor port", f"{address} is not answered by this home's process ({taken or 'nobody is there'})",
                      "stop what has the port, or correct `monitor`; then start again")
 
 
 def shake_hands(
     place: Address, identity: ids.Identity, trust: ids.Trust, server: str, mode: str, wall: Callable[[], datetime]
-) -> tuple[list[Event], int]:
-    """Try a session, and end it: what happened, and how many datagrams came back."""
+) -> tuple[Connected | HandshakeFailed, int]:
+    """Try a session, and end it: how that went, and how many datagrams came back."""
     sock, address = client_socket(place)
-    events: list[Event] = []
-    now = time.monotonic()
+    events, now = list[Event](), time.monotonic()
     config = ClientConfig(mode=Mode[mode.upper()], attempt_timeout=ATTEMPT_TIME)
     client = Client(config, identity, trust, server, now, wall=wall)
-    loop = UdpLoop(client, sock, events.append)
     client.connect(address, now)
-    try:
+    with closing(UdpLoop(client, sock, events.append)) as loop:
         while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(each, Connected) for each in events):
             loop.step(0.2)
         client.close(time.monotonic())
         loop.step(0.0)
-    finally:
-        loop.close()
-    return events, client.statistics()["datagrams_received"]
+    ends = [event for event in events if isinstance(event, Connected | HandshakeFailed)]
+    # A session, else a refusal with its reason: one attempt may have lost what another was told.
+    ends.sort(key=lambda end: (isinstance(end, HandshakeFailed), getattr(end, "hint", None) is None))
+    return [*ends, HandshakeFailed("no answer")][0], client.statistics()["datagrams_received"]
 
 
 def chain(ledger: Ledger) -> Findings:
@@ -233,11 +225,6 @@ def operator_configuration(home: Path, secret: bytes | None) -> Findings:
                          f'write server = "{robots}" into the robot.toml of who joined with it')
 
 
-def operator_certificates(home: Path, secret: bytes | None) -> Findings:
-    yield from certificates(OperatorHome(home).ca, "")
-    yield from certificates(OperatorHome(home).server, f"run `renew --home {home}`, then start the server again")
-
-
 def operator_passphrase(home: Path, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Keyring
 
@@ -261,10 +248,9 @@ def door(home: Path, secret: bytes | None) -> Findings:
         now = datetime.now(UTC)
         ca = ids.create_ca("doctor", at=now)  # who is not let in is refused, but by a server
         nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
-        near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listen.host, config.listen.host)  # noqa: S104
-        place = config.listen._replace(host=near)
-        events, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
-        runs = any(isinstance(event, HandshakeFailed) and event.hint is not None for event in events)
+        place = near(config.listen)
+        end, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
+        runs = isinstance(end, HandshakeFailed) and end.hint is not None
         if runs:
             yield ok("UDP port", f"a server answers at {place}")
         else:
@@ -402,23 +388,19 @@ def session(home: Path, secret: bytes | None) -> Findings:
     identity, roots = ids.load_identity(place.identity, secret)
     yield ok("password", f"opens the keys of {identity.name}")
     trust, wall = ids.Trust(roots), certificate_clock(place)
-    events, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
-    for event in events:
-        if isinstance(event, Connected):
-            yield ok("server", f"{server} made a session")
-            off = 0.0 if event.server_time is None else time.time() - event.server_time.timestamp()
-            if abs(off) > WRONG_CLOCK:
-                yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
-                             "set the one of the two that is wrong")
-            return
-    failures = [event for event in events if isinstance(event, HandshakeFailed)] or [HandshakeFailed("no answer")]
-    # One attempt may have lost what another was told.
-    failure = next((event for event in reversed(failures) if event.hint is not None), failures[-1])
-    silent = (
-        f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
-        f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
-    )
-    yield broken("server", f"{server}: {failure.why}", mend(failure, config.channel) if answers else silent)
+    found, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
+    if isinstance(found, HandshakeFailed):
+        silent = (
+            f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
+            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
+        )
+        yield broken("server", f"{server}: {found.why}", mend(found, config.channel) if answers else silent)
+        return
+    yield ok("server", f"{server} made a session")
+    off = 0.0 if found.server_time is None else time.time() - found.server_time.timestamp()
+    if abs(off) > WRONG_CLOCK:
+        yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
+                     "set the one of the two that is wrong")
 
 
 # A reader's folder
@@ -447,7 +429,10 @@ def reader_nodes(home: Path, secret: bytes | None) -> Findings:
 _MACHINE: dict[str, Check] = {"clock": clock, "home": files, "disk": disk}
 CHECKS: dict[HomeKind, dict[str, Check]] = {
     HomeKind.OPERATOR: _MACHINE | {
-        "configuration": operator_configuration, "certificates": operator_certificates,
+        "configuration": operator_configuration,
+        "certificates": lambda home, _: certificates(home / "ca", ""),
+        "server's certificates": lambda home, _: certificates(
+            home / "server", f"run `renew --home {home}`, then start the server again"),
         "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
         "node": operator_node,
     },
@@ -461,7 +446,7 @@ CHECKS: dict[HomeKind, dict[str, Check]] = {
 
 # The command
 
-_SIGN = {Result.OK: "ok", Result.NOTE: "NOTE", Result.BROKEN: "BROKEN", Result.SKIPPED: "not tried"}
+_SIGN = {"ok": "ok", "note": "NOTE", "broken": "BROKEN", "skipped": "not tried"}
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -488,12 +473,11 @@ def doctor(
     findings = []
     for finding in examine(CHECKS[kind], home, secret):
         findings.append(finding)
-        if not json and finding.result is not Result.OK:
+        if not json and finding.result != "ok":
             talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}. {finding.mend}")
-    count = sum(finding.result is Result.BROKEN for finding in findings)
+    count = sum(finding.result == "broken" for finding in findings)
     if json:
-        found = [{"what": f.what, "result": f.result, "found": f.found, "mend": f.mend} for f in findings]
-        print_json({"home": str(home), "kind": kind, "broken": count, "findings": found})
+        print_json({"home": str(home), "kind": kind, "broken": count, "findings": [f._asdict() for f in findings]})
     else:
         rows = [(f.what, _SIGN[f.result], f.found) for f in findings]
         data.print(table(f"The {kind}'s home {home}", ["what", "result", "found"], rows))

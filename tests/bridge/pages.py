@@ -1,7 +1,7 @@
 """A page of docs/ typed as it stands, in an empty folder: real processes, real services.
 
-The marks are words behind a fence's language. `sh`: run, in order, in one shell; `sh elsewhere`: not run, it installs
-or belongs to a machine that is not here. `toml FILE` and `conf FILE`: the block is that file; `>> FILE`: goes to its
+The marks are words behind a fence's language. `sh`: run, in order, in one shell; `sh MARK`: run by the test that asks for
+the mark, or not, as what installs or belongs to a machine that is not here. `toml FILE` and `conf FILE`: the block is that file; `>> FILE`: goes to its
 end. `text`: lines that the commands before have to print, on whichever stream; `…` stands for anything.
 Ports are replaced by free ones, so that pages run beside whatever else runs.
 """
@@ -31,11 +31,11 @@ def free_port(kind: int = socket.SOCK_STREAM) -> int:
         return int(probe.getsockname()[1])
 
 
-def script_of(page: str) -> tuple[str, list[str]]:
+def script_of(page: str, marked: str = "") -> tuple[str, list[str]]:
     """The page as a shell script, and what it has to print."""
     commands, says = list[str](), list[str]()
     for language, mark, text in _FENCE.findall((ROOT / "docs" / page).read_text(encoding="utf-8")):
-        if language == "sh" and not mark:
+        if language == "sh" and mark == marked:
             commands.append(text)
         elif language == "text" and not mark:
             says += text.splitlines()
@@ -47,13 +47,14 @@ def script_of(page: str) -> tuple[str, list[str]]:
 
 def type_page(
     page: str, folder: Path, *, ports: Mapping[str, int] | None = None, environment: Mapping[str, str] | None = None,
-    before: str = "", python: str = sys.executable, shell: tuple[str, ...] = ("bash",), typed: str = "",
+    before: str = "", marked: str = "", python: str = sys.executable, shell: tuple[str, ...] = ("bash",),
+    typed: str = "",
 ) -> str:  # fmt: skip
     """Run a page's commands and give what they printed.
 
     ports: written on the page -> here. before: commands of the test's own. python: that runs the bridge.
     """
-    commands, says = script_of(page)
+    commands, says = script_of(page, marked)
     for written, here in (ports or {}).items():
         commands = re.sub(rf"\b{written}\b", str(here), commands)
         says = [line.replace(written, str(here)) for line in says]

@@ -171,6 +171,17 @@ journalctl() {{ cat /etc/journal; }}
               typed="an operator's passphrase\n")  # fmt: skip
 
 
+def test_a_fleets_ca_is_the_bridges(tmp_path: Path):
+    """The first block of the page makes the CA, the last one gives it to the bridge."""
+    page = (ROOT / "docs" / "fleet-ca.md").read_text(encoding="utf-8")
+    [first, *_] = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    python = f'python() {{ PYTHONPATH={ROOT}/src {sys.executable} "$@"; }}'
+    type_page("fleet-ca.md", tmp_path, before=f"{python}\n{first}", marked="bridge")
+    assert not (tmp_path / "operator" / "ca").exists()
+    assert (tmp_path / "operator/ca.crt.pem").read_bytes() == (tmp_path / "fleet/ca.crt.pem").read_bytes()
+    load_ca(OperatorHome(tmp_path / "operator").ca, b"a long passphrase for the CA", datetime.now(UTC))
+
+
 PAGES = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
 _TOML = re.compile(r"^```toml[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
