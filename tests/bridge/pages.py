@@ -1,8 +1,9 @@
 """A page of docs/ typed as it stands, in an empty folder: real processes, real services.
 
-The marks are words behind a fence's language. `sh`: run, in order, in one shell; `sh MARK`: run by the test that asks for
-the mark, or not, as what installs or belongs to a machine that is not here. `toml FILE` and `conf FILE`: the block is that file; `>> FILE`: goes to its
-end. `text`: lines that the commands before have to print, on whichever stream; `…` stands for anything.
+The marks are words behind a fence's language. `sh`: run, in order, in one shell; `sh MARK`: run by the test that asks
+for the mark, or not, as what installs or belongs to a machine that is not here. `toml FILE` and `conf FILE`: the block
+is that file; `>> FILE`: goes to its end. `text`: lines that the commands before have to print, on whichever stream;
+`…` stands for anything.
 Ports are replaced by free ones, so that pages run beside whatever else runs.
 """
 
