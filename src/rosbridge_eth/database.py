@@ -57,16 +57,9 @@ class Database:
     """
 
     def __init__(
-        self,
-        path: Path,
-        what: str,
-        *,
-        application: int,
-        schema: str,
-        wal_pages: int,
-        exclusive: bool = False,
+        self, path: Path, what: str, *, application: int, schema: str, wal_pages: int, exclusive: bool = False,
         read_only: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.path, self._what, self._wal_pages = path, what, wal_pages
         self._exclusive = exclusive and not read_only
         self._reserve = path.with_name(path.name + ".reserve")

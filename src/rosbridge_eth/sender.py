@@ -66,13 +66,9 @@ class Sender:
     """
 
     def __init__(
-        self,
-        client: Client,
-        spool: Spool,
-        *,
-        channel: str = "exchange",
+        self, client: Client, spool: Spool, *, channel: str = "exchange",
         on_server_time: Callable[[float], None] = lambda seconds: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._client, self._spool, self._channel = client, spool, channel
         self._on_server_time = on_server_time
         self.begin_stream: Callable[[bytes], None] = lambda refused: None

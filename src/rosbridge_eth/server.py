@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from rosbridge_eth import protocol
@@ -26,6 +26,7 @@ from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refuse
 log = logging.getLogger(__name__)
 
 TURN = 0.05  # seconds that chunks are gathered for one commit
+ENOUGH = 64  # chunks, for which a commit does not wait
 LOOK_EVERY = 1.0  # seconds between looks at what the submitter and the operator changed
 HELD = 5.0  # seconds before a robot that was told to hold is asked to go on
 WELL_AFTER = 3 * HELD  # seconds without a chunk to try it with, after which a store that answers counts as well
@@ -43,7 +44,8 @@ class Session:
     peer: PeerIdentity
     tk: bytes
     heard: float
-    stream: bytes | None = None  # the one it asked about last
+    stream: bytes | None = None  # the one it asked about or sent last
+    asked: bool = False  # it is to be told what is stored of that stream
     held: bool = False  # told to hold: its offers are passed over until it asks again
     ask_at: float = 0.0  # when a robot that holds is told what is stored, so that it asks again
     refused: bytes | None = None  # the stream whose rest is passed over until it asks again
@@ -61,19 +63,13 @@ class Reception:
     """
 
     def __init__(
-        self,
-        server: Server,
-        inbox: Inbox,
-        ledger: bytes,
-        *,
-        allowed: Callable[[PeerIdentity], bool],
+        self, server: Server, inbox: Inbox, ledger: bytes, *, allowed: Callable[[PeerIdentity], bool],
         certificates: Callable[[str], bytes | None],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.server, self._inbox, self._ledger = server, inbox, ledger
         self._allowed, self._certificates = allowed, certificates
         self.sessions: dict[bytes, Session] = {}
         self._gone: dict[str, Session] = {}  # by name: sessions that a newer one of the same identity replaced
-        self._asked: list[Session] = []
         self._commit_at: float | None = None
         self._look_at = float("-inf")
         self.counts: Counter[str] = Counter()
@@ -90,7 +86,12 @@ class Reception:
             case Connected(peer=peer, connection=connection):
                 session = Session(connection, peer, robot_id(peer.name), now)
                 self.sessions[connection] = session
-                self._compare(session, self._gone.pop(peer.name, None), now)
+                before = self._gone.pop(peer.name, None)
+                if before is not None and now - before.heard <= ALIVE:
+                    log.warning(
+                        "%s: a session took the place of one that was alive: the robot was killed and started again,"
+                        " or two machines have its identity; then revoke it and register it anew", peer,
+                    )  # fmt: skip
                 log.info("%s: session begun", peer)
                 self._look_at = now  # its handshake may have been allowed before the list changed
             case Disconnected(reason=reason, connection=connection):
@@ -115,8 +116,7 @@ class Reception:
         match message:
             case Where(stream=stream):
                 # Messages are in order: what it offers from here on was chosen after our answer to this.
-                session.stream, session.held, session.refused = stream, False, None
-                self._asked.append(session)
+                session.stream, session.asked, session.held, session.refused = stream, True, False, None
             case Offer(chunk=encoded):
                 if session.held:
                     return
@@ -124,7 +124,7 @@ class Reception:
                 if chunk is None or chunk.header.stream == session.refused:
                     return
                 if session.mismatch is not None:
-                    self._hold([session], session.mismatch, now)
+                    self._hold(session, session.mismatch, now)
                     return
                 session.offers.append(chunk)
         if self._commit_at is None:
@@ -157,7 +157,8 @@ class Reception:
 
         wall: seconds since 1970, for the inbox.
         """
-        if self._commit_at is not None and (now >= self._commit_at or self._enough()):
+        enough = sum(len(session.offers) for session in self.sessions.values()) >= ENOUGH
+        if self._commit_at is not None and (now >= self._commit_at or enough):
             self._commit_at = None
             self.commit(now, wall)
         if now >= self._look_at:
@@ -165,24 +166,20 @@ class Reception:
             self._append([], now, wall)
             self.look(now)
 
-    def _enough(self) -> bool:
-        return sum(len(session.offers) for session in self.sessions.values()) >= 64
-
     def commit(self, now: float, wall: float) -> None:
         """Everything gathered goes into the inbox by one commit; then each robot is answered."""
-        gathered = [(session, chunk) for session in self.sessions.values() for chunk in session.offers]
-        asked, self._asked = self._asked, []
-        for session in self.sessions.values():
-            session.offers = []
+        waiting = [session for session in self.sessions.values() if session.asked or session.offers]
+        gathered = [(session, chunk) for session in waiting for chunk in session.offers]
         outcomes = self._append([(session.tk, chunk) for session, chunk in gathered], now, wall)
-        if outcomes is None:
-            self._hold([*asked, *(session for session, _ in gathered)], "the server's store is away", now)
-            return
-        answers: dict[int, Session] = {id(session): session for session in asked}
-        for (session, chunk), outcome in zip(gathered, outcomes, strict=True):
-            self._take_outcome(session, chunk, outcome, answers, now)
-        for session in answers.values():
-            self._say_stored(session, now)
+        for (session, chunk), outcome in zip(gathered, outcomes or (), strict=False):
+            self._take_outcome(session, chunk, outcome, now)
+        for session in waiting:
+            why = "the server's store is away" if outcomes is None else session.mismatch
+            if why is not None:
+                self._hold(session, why, now)
+            elif session.asked and not session.held:
+                self._answer(session, now)
+            session.asked, session.offers = False, []
 
     def _append(self, chunks: list[tuple[bytes, Chunk]], now: float, wall: float) -> list[Outcome] | None:
         """Without chunks only asks whether the store is there, and the same. None where nothing was taken."""
@@ -201,41 +198,31 @@ class Reception:
             self.trouble.now(None)
         return outcomes
 
-    def _take_outcome(
-        self, session: Session, chunk: Chunk, outcome: Outcome, answers: dict[int, Session], now: float
-    ) -> None:
+    def _take_outcome(self, session: Session, chunk: Chunk, outcome: Outcome, now: float) -> None:
         self.counts[outcome.name.lower()] += 1
         match outcome:
             case Outcome.STORED | Outcome.KNOWN:
                 if outcome is Outcome.STORED:
                     self.records[session.peer.name] += chunk.header.records
                     self.newest[session.peer.name] = chunk.header.sealed_ms / 1000
-                session.stream = chunk.header.stream
-                answers[id(session)] = session
+                session.stream, session.asked = chunk.header.stream, True
             case Outcome.DIFFERENT:
                 if chunk.header.stream != session.refused:
                     self._refuse(session, chunk, "another chunk with this number is there")
             case Outcome.FULL:
-                self._hold([session], "the room for this robot's chunks is full until some are on the chain", now)
-
-    def _say_stored(self, session: Session, now: float) -> None:
-        if session.mismatch is not None:
-            self._hold([session], session.mismatch, now)
-        if session.stream is None or session.held:
-            return
-        self._answer(session, now)
+                self._hold(session, "the room for this robot's chunks is full until some are on the chain", now)
 
     def _answer(self, session: Session, now: float) -> None:
+        """Say what is stored of its stream."""
         if session.stream is None:
             return
         try:
             head: Head | None = self._inbox.head(session.tk, session.stream)
         except StoreError as error:
             self.trouble.now(str(error))
-            self._hold([session], "the server's store is away", now)
+            self._hold(session, "the server's store is away", now)
             return
-        number, digest = (None, _NO_DIGEST) if head is None else head
-        self._send(session, Stored(session.stream, number, digest))
+        self._send(session, Stored(session.stream, *(head or (None, _NO_DIGEST))))
 
     # Once a second
 
@@ -262,11 +249,10 @@ class Reception:
 
     # Answers
 
-    def _hold(self, sessions: Iterable[Session], why: str, now: float) -> None:
-        for session in sessions:
-            if not session.held and self.sessions.get(session.connection) is session:
-                session.held, session.ask_at = True, now + HELD
-                self._send(session, Hold(why))
+    def _hold(self, session: Session, why: str, now: float) -> None:
+        if not session.held and self.sessions.get(session.connection) is session:
+            session.held, session.ask_at = True, now + HELD
+            self._send(session, Hold(why))
 
     def _refuse(self, session: Session, chunk: Chunk, why: str) -> None:
         self.counts["refused"] += 1
@@ -282,14 +268,6 @@ class Reception:
         else:  # it takes none of our packets: it comes back with a new session, and asks
             log.warning("%s: takes no answers; its session is closed", session.peer)
             self.server.close_connection(session.connection)
-
-    def _compare(self, session: Session, before: Session | None, now: float) -> None:
-        """A session that took the place of a living one: perhaps two machines have one identity."""
-        if before is not None and now - before.heard <= ALIVE:
-            log.warning(
-                "%s: a session took the place of one that was alive: the robot was killed and started again, or two"
-                " machines have its identity; then revoke it and register it anew", session.peer,
-            )
 
 
 class Worker:

@@ -39,25 +39,19 @@ CREATE INDEX IF NOT EXISTS chunk_by_state ON chunk (state, position);
 -- Sums over the chunks in each state, kept by the triggers.
 CREATE TABLE IF NOT EXISTS held (state INTEGER PRIMARY KEY, chunks INTEGER, records INTEGER, bytes INTEGER);
 INSERT OR IGNORE INTO held VALUES (2, 0, 0, 0), (3, 0, 0, 0), (4, 0, 0, 0), (5, 0, 0, 0);
-CREATE TRIGGER IF NOT EXISTS added AFTER INSERT ON chunk BEGIN
-    UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
-    WHERE state = new.state;
-END;
-CREATE TRIGGER IF NOT EXISTS removed AFTER DELETE ON chunk BEGIN
-    UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
-    WHERE state = old.state;
-END;
-CREATE TRIGGER IF NOT EXISTS changed AFTER UPDATE ON chunk BEGIN
-    UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size
-    WHERE state = old.state;
-    UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size
-    WHERE state = new.state;
-END;
+CREATE TRIGGER IF NOT EXISTS added AFTER INSERT ON chunk BEGIN {more} END;
+CREATE TRIGGER IF NOT EXISTS removed AFTER DELETE ON chunk BEGIN {less} END;
+CREATE TRIGGER IF NOT EXISTS changed AFTER UPDATE ON chunk BEGIN {less} {more} END;
 -- One row: whose log, the newest header ever appended, and what was dropped since the spool was made.
 CREATE TABLE IF NOT EXISTS spool (
     ledger BLOB, tk BLOB, last BLOB, dropped_bodies INTEGER, dropped_headers INTEGER, dropped_records INTEGER
 );
-"""
+""".format(
+    more="UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size"
+    " WHERE state = new.state;",
+    less="UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size"
+    " WHERE state = old.state;",
+)
 _OLDEST: Final = "SELECT position, records, chunk FROM chunk WHERE state = ? ORDER BY position LIMIT 1"
 # The place in the log of a stream's newest chunk up to a number.
 _UP_TO: Final = "(SELECT position FROM chunk WHERE stream = ? AND number <= ? ORDER BY number DESC LIMIT 1)"

@@ -199,14 +199,9 @@ class Inbox(Protocol):
             )  # fmt: skip
 
     def rebase(
-        self,
-        tk: bytes,
-        tail: Chunk | None,
-        on_chain: Collection[bytes],
-        heads: Mapping[bytes, Head],
-        now: float,
+        self, tk: bytes, tail: Chunk | None, on_chain: Collection[bytes], heads: Mapping[bytes, Head], now: float,
         before: Sequence[Chunk] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Make the rows follow a chain whose last chunk, `tail`, is not among them (None: the chain has none).
 
         Rows whose digest is in `on_chain` go, `tail` becomes the first row, the others stay behind it in their

@@ -39,6 +39,7 @@ CREATE TABLE IF NOT EXISTS head (
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS dead (no INTEGER PRIMARY KEY AUTOINCREMENT, tk BLOB, why TEXT, taken_at REAL, chunk BLOB);
 """
+_NEXT: Final = "UPDATE robot SET next = next + 1 WHERE tk = ? AND bytes <= ? RETURNING next"
 _BURY: Final = "INSERT INTO dead SELECT NULL, tk, ?, taken_at, chunk FROM chunk WHERE tk = ? AND position = ?"
 
 
@@ -91,16 +92,21 @@ class SqliteInbox(Inbox):
     def _append(self, chunks: Sequence[tuple[bytes, Chunk, bytes]], now: float) -> list[Outcome]:
         outcomes: list[Outcome] = []
         full: set[bytes] = set()
+        (room,) = self._db.one("SELECT ? - coalesce(sum(bytes), 0) FROM robot", (self.max_bytes,))
         for tk, chunk, hash in chunks:
             header, head = chunk.header, self.head(tk, chunk.header.stream)
             if head is not None and header.number <= head.number:
                 outcomes.append(self._compare(tk, chunk, head))
-            elif tk in full or not self._has_room(tk, len(chunk.encoded)):
+                continue
+            self._db.run("INSERT OR IGNORE INTO robot (tk) VALUES (?)", (tk,))
+            size = len(chunk.encoded)
+            place = None if tk in full or size > room else self._db.one(_NEXT, (tk, self.max_bytes_per_robot - size))
+            if place is None:
                 full.add(tk)
                 outcomes.append(Outcome.FULL)
             else:
-                (next,) = self._db.one("UPDATE robot SET next = next + 1 WHERE tk = ? RETURNING next", (tk,))
-                self._add(tk, next, chunk, hash, now)
+                room -= size
+                self._add(tk, place[0], chunk, hash, now)
                 self._raise(tk, header.stream, header.number, header.digest)
                 outcomes.append(Outcome.STORED)
         return outcomes
@@ -112,11 +118,6 @@ class SqliteInbox(Inbox):
         if header.number == head.number:
             there.add(head.digest)
         return Outcome.DIFFERENT if there and header.digest not in there else Outcome.KNOWN
-
-    def _has_room(self, tk: bytes, size: int) -> bool:
-        self._db.run("INSERT OR IGNORE INTO robot (tk) VALUES (?)", (tk,))
-        own, total = self._db.one("SELECT bytes, (SELECT sum(bytes) FROM robot) FROM robot WHERE tk = ?", (tk,))
-        return bool(own + size <= self.max_bytes_per_robot and total + size <= self.max_bytes)
 
     def _add(self, tk: bytes, position: int, chunk: Chunk, hash: bytes, now: float) -> None:
         header, encoded = chunk.header, chunk.encoded

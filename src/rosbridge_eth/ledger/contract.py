@@ -21,16 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.ledger.transport import (
-    AlreadyKnown,
-    Node,
-    NonceTooLow,
-    Reverted,
-    TooMuch,
-    Underpriced,
-    bytes32,
-    natural,
-)
+from rosbridge_eth.ledger import transport
+from rosbridge_eth.ledger.transport import AlreadyKnown, Node, NonceTooLow, TooMuch, Underpriced, bytes32, natural
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
@@ -177,7 +169,8 @@ class Ledger:
     def deploy(where: Any, operator: LocalAccount, *, wait: float = 120.0) -> tuple[Ledger, Receipt]:
         """Create the contract; `operator` pays and becomes its operator. Waits until a block holds it."""
         nowhere = Ledger(where, "0x" + "00" * 20)
-        receipt = nowhere._send_and_wait(operator, None, bytes.fromhex(artifact()["bytecode"]), 0, 2_500_000, wait)
+        code = bytes.fromhex(artifact()["bytecode"])
+        receipt = nowhere._send_and_wait(operator, code, 0, 2_500_000, wait, creates=True)
         if receipt.contract is None:
             raise ChainError(f"{nowhere.url} mined the deployment but names no contract address")
         return Ledger(where, receipt.contract), receipt
@@ -233,12 +226,9 @@ class Ledger:
             got: Any = self._w3.eth.get_block(number)  # type: ignore[arg-type]
             fee = got.get("baseFeePerGas")
             found = Block(
-                natural(got["number"]),
-                natural(got["timestamp"]),
-                bytes32(got["hash"]),
-                natural(got["gasLimit"]),
+                natural(got["number"]), natural(got["timestamp"]), bytes32(got["hash"]), natural(got["gasLimit"]),
                 None if fee is None else natural(fee, 2**128),
-            )
+            )  # fmt: skip
             if number not in ("latest", found.number):
                 raise ValueError(f"block {found.number} in place of block {number}")
             return found
@@ -376,9 +366,20 @@ class Ledger:
     def calldata(self, function: str, *arguments: Any) -> bytes:
         return bytes.fromhex(self._contract.encode_abi(function, args=arguments)[2:])
 
-    def sign(self, account: LocalAccount, data: bytes, *, nonce: int, gas: int, fees: Fees, value: int = 0) -> Signed:
-        """A transaction to the contract, for the chain whose id this node first gave."""
-        return self._sign(account, self.contract, data, nonce, gas, fees, value)
+    def sign(
+        self, account: LocalAccount, data: bytes, *, nonce: int, gas: int, fees: Fees, value: int = 0,
+        creates: bool = False,
+    ) -> Signed:  # fmt: skip
+        """A transaction to the contract, or one that creates it, for the chain whose id this node first gave."""
+        fields: dict[str, Any] = {"chainId": self.chain_id, "nonce": nonce, "gas": gas, "value": value, "data": data}
+        if not creates:
+            fields["to"] = self.contract
+        if fees.tip is None:
+            fields["gasPrice"] = fees.highest
+        else:
+            fields |= {"type": 2, "maxFeePerGas": fees.highest, "maxPriorityFeePerGas": fees.tip}
+        signed = account.sign_transaction(fields)
+        return Signed(bytes(signed.raw_transaction), bytes(signed.hash))
 
     def send(self, raws: Sequence[bytes]) -> list[ChainError | None]:
         """Hand signed transactions to the node; for each None, or why it was refused."""
@@ -415,7 +416,7 @@ class Ledger:
         data = self.calldata(function, *arguments)
         gas = set_data_gas([len(chunk) for chunk in arguments[-1]]) if function == "setData" else call_gas(data)
         self.call(account.address, data, value=value, gas=gas)
-        return self._send_and_wait(account, self.contract, data, value, gas, wait)
+        return self._send_and_wait(account, data, value, gas, wait)
 
     def set_data(self, account: LocalAccount, tk: bytes, chunks: Sequence[bytes]) -> Receipt:
         """SetData: write these chunks behind what is there, and wait. The submitter does it without waiting."""
@@ -441,28 +442,17 @@ class Ledger:
     def accept_operator(self, account: LocalAccount) -> Receipt:
         return self.transact(account, "acceptOperator")
 
-    def _sign(
-        self, account: LocalAccount, to: str | None, data: bytes, nonce: int, gas: int, fees: Fees, value: int
-    ) -> Signed:
-        fields: dict[str, Any] = {"chainId": self.chain_id, "nonce": nonce, "gas": gas, "value": value, "data": data}
-        if to is not None:
-            fields["to"] = to
-        if fees.tip is None:
-            fields["gasPrice"] = fees.highest
-        else:
-            fields |= {"type": 2, "maxFeePerGas": fees.highest, "maxPriorityFeePerGas": fees.tip}
-        signed = account.sign_transaction(fields)
-        return Signed(bytes(signed.raw_transaction), bytes(signed.hash))
-
     def _send_and_wait(
-        self, account: LocalAccount, to: str | None, data: bytes, value: int, gas: int, wait: float
+        self, account: LocalAccount, data: bytes, value: int, gas: int, wait: float, *, creates: bool = False
     ) -> Receipt:
         """Behind what the account has in the pool; again with the next number if another transaction took its own."""
         deadline, signed, nonce, pause = time.monotonic() + wait, None, 0, 0.02
         while time.monotonic() < deadline:
             if signed is None:
                 [(_, nonce)] = self.nonces([account.address])
-                signed = self._sign(account, to, data, nonce, gas, self.fees(self.block()), value)
+                signed = self.sign(
+                    account, data, nonce=nonce, gas=gas, fees=self.fees(self.block()), value=value, creates=creates
+                )
                 [error] = self.send([signed.raw])
                 if isinstance(error, NonceTooLow | Underpriced):
                     signed = None  # somebody else was faster
@@ -470,7 +460,7 @@ class Ledger:
                     raise error
             elif (receipt := self.receipt(signed.hash)) is not None:
                 if not receipt.succeeded:
-                    raise Reverted(f"transaction 0x{signed.hash.hex()} failed in block {receipt.block}")
+                    raise transport.Reverted(f"transaction 0x{signed.hash.hex()} failed in block {receipt.block}")
                 return receipt
             elif self.nonces([account.address])[0][0] > nonce and self.receipt(signed.hash) is None:
                 signed = None

@@ -31,17 +31,8 @@ from eth_utils.crypto import keccak
 from rosbridge_eth.chunk import Chunk, Header, Malformed
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.inbox import Head, Inbox, Row
-from rosbridge_eth.ledger.contract import (
-    BALANCE_LIMIT,
-    NOTHING,
-    WEI_PER_ETH,
-    Block,
-    Fees,
-    Ledger,
-    Standing,
-    call_gas,
-    set_data_gas,
-)
+from rosbridge_eth.ledger import contract
+from rosbridge_eth.ledger.contract import Block, Fees, Ledger, Standing
 from rosbridge_eth.ledger.transport import AlreadyKnown, NonceTooLow, OutOfFunds, Reverted, Underpriced
 from rosbridge_eth.ledger.walk import Walk
 
@@ -68,8 +59,8 @@ class Settings:
 
     confirmations: int = 1
     max_fee: int = 500 * 10**9
-    low_water: int = WEI_PER_ETH // 20
-    top_up: int = WEI_PER_ETH // 2
+    low_water: int = contract.WEI_PER_ETH // 20
+    top_up: int = contract.WEI_PER_ETH // 2
     gas_per_day: int = 30_000_000_000
 
 
@@ -128,14 +119,9 @@ class Submitter:
     """
 
     def __init__(
-        self,
-        ledger: Ledger,
-        inbox: Inbox,
-        robots: Callable[[], Collection[bytes]],
-        account: Callable[[bytes], LocalAccount | None],
-        operator: LocalAccount | None,
-        settings: Settings,
-    ) -> None:
+        self, ledger: Ledger, inbox: Inbox, robots: Callable[[], Collection[bytes]],
+        account: Callable[[bytes], LocalAccount | None], operator: LocalAccount | None, settings: Settings,
+    ) -> None:  # fmt: skip
         self._ledger, self._inbox, self._robots = ledger, inbox, robots
         self._account, self._operator, self._settings = account, operator, settings
         self._known: dict[bytes, Account] = {}
@@ -200,7 +186,7 @@ class Submitter:
                     account.hold, account.flights = None, []
             except _Hold as why:
                 account.hold = str(why)
-            certificates = NOTHING if standing.revoked else standing.certificates_hash
+            certificates = contract.NOTHING if standing.revoked else standing.certificates_hash
             self._inbox.set_state(tk, hold=account.hold, certificates_hash=certificates)
         if head.base_fee is not None and head.base_fee > self._settings.max_fee:
             self.trouble = f"a unit of gas costs {head.base_fee / 10**9:.1f} gwei, which is above max_fee_gwei"
@@ -249,7 +235,7 @@ class Submitter:
         tk, standing, after, _ = work
         whole = self._inbox.head(tk, ALL) is not None
         if after is None and not whole:
-            self._inbox.raise_heads(tk, {ALL: Head(0, NOTHING)}, now)
+            self._inbox.raise_heads(tk, {ALL: Head(0, contract.NOTHING)}, now)
         if after is None or whole:
             return self._inbox.rows(tk, after, ROWS)
         rows = self._inbox.rows(tk, after, 8 * IN_FLIGHT)
@@ -282,7 +268,7 @@ class Submitter:
                 if count == WALK:
                     raise _Hold("what is on the chain is being read")
             else:
-                walk.heads[ALL] = Head(0, NOTHING)  # nothing is left that was not read
+                walk.heads[ALL] = Head(0, contract.NOTHING)  # nothing is left that was not read
         except ChainError as error:
             account.walk = None
             raise _Hold(f"what is on the chain cannot be read: {error}") from error
@@ -334,9 +320,7 @@ class Submitter:
                     self._flush(outbox)
         self._flush(outbox)
 
-    def _reconcile(
-        self, account: Account, standing: Standing, rows: Sequence[Row], latest: int, now: float
-    ) -> None:
+    def _reconcile(self, account: Account, standing: Standing, rows: Sequence[Row], latest: int, now: float) -> None:
         """What became of the transactions in flight, by the account's nonce and the contract's count."""
         done = 0 if account.nonce is None else latest - account.nonce
         mined, account.flights = account.flights[: max(done, 0)], account.flights[max(done, 0) :]
@@ -454,7 +438,7 @@ class Submitter:
         for w in work:
             account = self._known[w.tk]
             cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
-            if w.standing.balance < min(max(self._settings.low_water, cost), BALANCE_LIMIT // 2):
+            if w.standing.balance < min(max(self._settings.low_water, cost), contract.BALANCE_LIMIT // 2):
                 poor.append(w.standing)
         if self._operator is None or not poor or (pending > latest and not funds.due(now)):
             return
@@ -465,15 +449,13 @@ class Submitter:
         self.funds, raws = None, list[bytes]()
         for standing in sorted(poor, key=lambda standing: standing.balance)[:TOP_UPS]:
             data = self._ledger.calldata("allocETH", standing.account)
-            wei = min(self._settings.top_up, BALANCE_LIMIT - standing.balance)
-            left -= wei + call_gas(data) * funds.fees.highest
+            wei = min(self._settings.top_up, contract.BALANCE_LIMIT - standing.balance)
+            left -= wei + contract.call_gas(data) * funds.fees.highest
             if left < 0:
                 self.funds = f"the operator's account {self._operator.address} is empty; pay something into it"
                 break
-            nonce, gas = latest + len(raws), call_gas(data)
-            raws.append(
-                self._ledger.sign(self._operator, data, nonce=nonce, gas=gas, fees=funds.fees, value=wei).raw
-            )
+            nonce, gas = latest + len(raws), contract.call_gas(data)
+            raws.append(self._ledger.sign(self._operator, data, nonce=nonce, gas=gas, fees=funds.fees, value=wei).raw)
         self.counts["top-ups"] += len(raws)
         for error in self._ledger.send(raws):
             if error is not None and not isinstance(error, AlreadyKnown):
@@ -482,9 +464,9 @@ class Submitter:
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:
     """As many rows as one transaction takes, one at least."""
-    count, size, gas = 0, 0, set_data_gas([])
+    count, size, gas = 0, 0, contract.set_data_gas([])
     for row in rows:
-        more = set_data_gas([row.size]) - set_data_gas([])
+        more = contract.set_data_gas([row.size]) - contract.set_data_gas([])
         if count and (size + row.size > BATCH_BYTES or gas + more > most):
             break
         count, size, gas = count + 1, size + row.size, gas + more

@@ -29,7 +29,6 @@ from urllib.parse import urlsplit
 
 import requests
 from requests.adapters import HTTPAdapter
-from urllib3.connection import HTTPConnection, HTTPSConnection
 from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 
 from rosbridge_eth.errors import ChainError
@@ -157,20 +156,10 @@ class _DeadlineMixin:
         return super().getresponse()  # type: ignore[misc]
 
 
-class _Connection(_DeadlineMixin, HTTPConnection):
-    pass
-
-
-class _TlsConnection(_DeadlineMixin, HTTPSConnection):
-    pass
-
-
-class _Pool(HTTPConnectionPool):
-    ConnectionCls = _Connection
-
-
-class _TlsPool(HTTPSConnectionPool):
-    ConnectionCls = _TlsConnection
+def _with_deadline(pool: type[Any]) -> type[Any]:
+    """A class of connection pools, with such connections."""
+    connection = type("Connection", (_DeadlineMixin, pool.ConnectionCls), {})
+    return type("Pool", (pool,), {"ConnectionCls": connection})
 
 
 class BoundedAdapter(HTTPAdapter):
@@ -182,7 +171,9 @@ class BoundedAdapter(HTTPAdapter):
 
     def init_poolmanager(self, *args: Any, **options: Any) -> None:
         super().init_poolmanager(*args, **options)
-        self.poolmanager.pool_classes_by_scheme = {"http": _Pool, "https": _TlsPool}
+        self.poolmanager.pool_classes_by_scheme = {
+            "http": _with_deadline(HTTPConnectionPool), "https": _with_deadline(HTTPSConnectionPool),
+        }  # fmt: skip
 
     def send(self, request: Any, *args: Any, **options: Any) -> requests.Response:
         response = super().send(request, *args, **(options | {"stream": True}))
