@@ -6,6 +6,7 @@ permitted. One client at a time is told from the server by its address.
 
 from __future__ import annotations
 
+import contextlib
 import random
 import select
 import socket
@@ -41,7 +42,6 @@ class Relay:
         self._near.bind(("127.0.0.1", 0))
         self._far.bind(("127.0.0.1", 0))
         self.port: int = self._near.getsockname()[1]
-        self.passed = self.lost = 0
         self._client: tuple[str, int] | None = None
         self._held: dict[socket.socket, tuple[bytes, tuple[str, int]]] = {}
         self._stop = threading.Event()
@@ -69,21 +69,15 @@ class Relay:
                     self._pass(self._near, data, self._client)
 
     def _pass(self, out: socket.socket, data: bytes, to: tuple[str, int]) -> None:
-        if self._random.random() < self._harm.loss:
-            self.lost += 1
+        chance = self._random.random
+        if chance() < self._harm.loss:
             return
-        if out not in self._held and self._random.random() < self._harm.reorder:
+        if out not in self._held and chance() < self._harm.reorder:
             self._held[out] = data, to  # goes after the next one
             return
-        self._send(out, data, to)
-        if self._random.random() < self._harm.duplicate:
-            self._send(out, data, to)
+        going = [(data, to)] * (2 if chance() < self._harm.duplicate else 1)
         if out in self._held:
-            self._send(out, *self._held.pop(out))
-
-    def _send(self, out: socket.socket, data: bytes, to: tuple[str, int]) -> None:
-        try:
-            out.sendto(data, to)
-            self.passed += 1
-        except OSError:
-            self.lost += 1
+            going.append(self._held.pop(out))
+        for each in going:
+            with contextlib.suppress(OSError):  # lost, too
+                out.sendto(*each)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hmac
 from collections import OrderedDict
 from hashlib import blake2s
-from ipaddress import IPv4Address, ip_address
+from ipaddress import ip_address
 
 from rosbridge_eth.channel.wire import COOKIE_SIZE, Hello
 
@@ -60,8 +60,11 @@ class TokenBucket:
         return self.level
 
     def ready_at(self) -> float:
-        """When `available` will be above zero, if nothing is charged until then; to be asked after `available`."""
-        return self._at + max(0.0, -self.level) / self.rate + 0.001
+        """When `available` will be above zero, if nothing is charged until then; to be asked after `available`.
+
+        Rounded up, or a timer may fire a hair too early and find nothing to do.
+        """
+        return self._at + max(0.0, -self.level) / self.rate + 1e-4
 
     def charge(self, amount: float) -> None:
         self.level = min(self.burst, self.level - amount)
@@ -87,9 +90,8 @@ class Sources:
             ip = ip_address(address[0].partition("%")[0])
         except ValueError:
             return address[0]
-        if isinstance(ip, IPv4Address):
-            return str(ip)
-        return str(ip.ipv4_mapped) if ip.ipv4_mapped else ip.exploded[:19]
+        ip = getattr(ip, "ipv4_mapped", None) or ip
+        return str(ip) if ip.version == 4 else ip.exploded[:19]
 
     def take(self, address: Address, now: float) -> bool:
         """One token for a handshake from `address`; False if there is none."""

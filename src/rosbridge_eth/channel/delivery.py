@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 
+from rosbridge_eth.channel.admission import TokenBucket
 from rosbridge_eth.channel.wire import DATAGRAM_SIZE
 
 PACKET_THRESHOLD = 3
@@ -72,8 +73,8 @@ class Window:
     """
 
     __slots__ = (
-        "_allowance", "_base", "_base_at", "_delivered", "_next_base", "_paced_at", "_recent", "_round_end",
-        "_round_rtt", "limited", "maximum", "size",
+        "_base", "_base_at", "_delivered", "_next_base", "_pacing", "_recent", "_round_end", "_round_rtt", "limited",
+        "maximum", "size",
     )  # fmt: skip
 
     def __init__(self, now: float, maximum: int = MAX_WINDOW) -> None:
@@ -86,8 +87,7 @@ class Window:
         self._round_end = 0  # a round trip is over when a packet sent after its beginning is acknowledged
         self._delivered = 0
         self._recent: deque[int] = deque(maxlen=GAIN_PERIOD)  # what round trips delivered
-        self._allowance = float(PACING_BURST)
-        self._paced_at = now
+        self._pacing = TokenBucket(0.0, PACING_BURST, now)
 
     def acknowledged(self, size: int, rtt: float | None, largest: int, next_number: int, now: float) -> None:
         """`size` bytes arrived; `largest` is the highest number acknowledged, `next_number` the next one's."""
@@ -119,17 +119,12 @@ class Window:
         """After an outage: begin again at the minimum, so that what waited does not come as a flood (7.6)."""
         self.size = MINIMUM_WINDOW
         self._recent.clear()
-        self._allowance = min(self._allowance, float(MINIMUM_WINDOW))
+        self._pacing.level = min(self._pacing.level, MINIMUM_WINDOW)
 
     def wait(self, now: float, rtt: float) -> float:
         """Seconds until pacing lets another datagram go; 0 is now."""
-        rate = PACING_GAIN * self.size / max(rtt, GRANULARITY)
-        elapsed = now - self._paced_at
-        if elapsed > 0:
-            self._allowance = min(self._allowance + elapsed * rate, float(PACING_BURST))
-            self._paced_at = now
-        # Rounded up, or a timer may fire a hair too early and find nothing to do.
-        return 0.0 if self._allowance > 0 else -self._allowance / rate + 1e-4
+        self._pacing.rate = PACING_GAIN * self.size / max(rtt, GRANULARITY)
+        return 0.0 if self._pacing.available(now) > 0 else self._pacing.ready_at() - now
 
     def sent(self, size: int) -> None:
-        self._allowance -= size
+        self._pacing.charge(size)

@@ -118,7 +118,7 @@ class Inbox(Protocol):
     def head(self, tk: bytes, stream: bytes) -> Head | None:
         """The newest chunk of the stream that was ever taken; it outlives the row."""
 
-    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head], now: float) -> None:
+    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head]) -> None:
         """These chunks are on the chain: from now on nothing of these streams up to them is taken."""
 
     def sizes(self) -> dict[bytes, int]:
@@ -159,10 +159,6 @@ class Inbox(Protocol):
 
     # What they have in common
 
-    def robots(self) -> list[bytes]:
-        """All of whom there ever was a row or a state."""
-        return list(self.sizes())
-
     def state(self, tk: bytes) -> RobotState:
         """What was set last, or nothing at all."""
         text = self._load(tk)
@@ -198,21 +194,16 @@ class Inbox(Protocol):
                 mark=known.mark if kept else position, marked_at=known.marked_at if kept else now,
             )  # fmt: skip
 
-    def rebase(
-        self, tk: bytes, tail: Chunk | None, on_chain: Collection[bytes], heads: Mapping[bytes, Head], now: float,
-        before: Sequence[Chunk] = (),
-    ) -> None:  # fmt: skip
-        """Make the rows follow a chain whose last chunk, `tail`, is not among them (None: the chain has none).
+    def rebase(self, tk: bytes, front: Sequence[Chunk], on_chain: Collection[bytes], now: float) -> None:
+        """Make the rows follow a chain whose last chunk is not among them.
 
-        Rows whose digest is in `on_chain` go, `tail` becomes the first row, the others stay behind it in their
-        order, perhaps at other positions; heads are raised; nothing is confirmed until `confirm` says so. A caller
-        who reads rows to see which of them are on the chain calls `raise_heads` before: then none that is can be
-        added meanwhile. before: what is on the chain right before the tail and not confirmed; it becomes rows, too,
-        because a robot is not asked again for what is below a head, should the chain turn back.
+        front: what is on the chain and not confirmed, and ends with the chain's last chunk; it becomes the first rows,
+        because a robot is not asked again for what is below a head, should the chain turn back. Rows whose digest is
+        in `on_chain` go, the others stay behind it in their order, perhaps at other positions; nothing is confirmed
+        until `confirm` says so. A caller who reads rows to see which of them are on the chain calls `raise_heads`
+        before: then none that is can be added meanwhile.
         """
-        front = [*before, *([] if tail is None else [tail])]
-        newest = {one.header.stream: Head(one.header.number, one.header.digest) for one in front}
-        self.raise_heads(tk, newest | dict(heads), now)
+        self.raise_heads(tk, {one.header.stream: Head(one.header.number, one.header.digest) for one in front})
         self.confirm(tk, None, now)
         self._put_in_front(tk, front, {*on_chain, *(one.header.digest for one in front)}, now)
 
@@ -257,7 +248,7 @@ class Inbox(Protocol):
 
     def totals(self) -> dict[bytes, Waiting]:
         """What waits, of every robot."""
-        return {tk: self.waiting(tk, self.state(tk).position) for tk in self.robots()}
+        return {tk: self.waiting(tk, self.state(tk).position) for tk in self.sizes()}
 
 
 def open_inbox(

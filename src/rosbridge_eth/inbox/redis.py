@@ -125,7 +125,7 @@ class RedisInbox(Inbox):
         letters = {tk: iter(answer.decode()) for tk, answer in zip(calls, answers, strict=True)}
         return [_OUTCOMES[next(letters[tk])] for tk, _ in chunks]
 
-    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head], now: float) -> None:
+    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head]) -> None:
         flat = [part for stream, head in heads.items() for part in (stream, _number(head.number), head.digest)]
         self._run([("raise_heads", tk, flat)])
 
@@ -245,21 +245,14 @@ class RedisInbox(Inbox):
     def _run(self, calls: Collection[tuple[str, bytes, Sequence[Any]]]) -> list[Any]:
         """Operations of the script, (name, Tk, arguments), each whole or not at all; their answers."""
         with self._talking():
-            answers = self._ask("EVALSHA", _script()[1], calls)
-            if any(isinstance(answer, redis.exceptions.NoScriptError) for answer in answers):  # a Redis started since
-                answers = self._ask("EVAL", _script()[0], calls)
+            pipe = self._redis.pipeline(transaction=False)
+            for operation, tk, arguments in calls:
+                pipe.evalsha(_script()[1], 1, self._prefix, operation, self.id, self._run_id, tk.hex(), *arguments)
+            answers: list[Any] = pipe.execute(raise_on_error=False)
             for answer in answers:
                 if isinstance(answer, Exception):
                     raise answer
         return answers
-
-    def _ask(self, command: str, script: str, calls: Collection[tuple[str, bytes, Sequence[Any]]]) -> list[Any]:
-        pipe = self._redis.pipeline(transaction=False)
-        for operation, tk, arguments in calls:
-            pipe.execute_command(
-                command, script, 1, self._prefix, operation, self.id, self._run_id, tk.hex(), *arguments
-            )
-        return list(pipe.execute(raise_on_error=False))
 
     @contextmanager
     def _talking(self) -> Iterator[None]:
@@ -267,7 +260,8 @@ class RedisInbox(Inbox):
         try:
             yield
         except redis.RedisError as error:
-            if "EXCHANGED" in str(error):
+            # Redis knows the script from `_open`; one that does not was started anew.
+            if "EXCHANGED" in str(error) or isinstance(error, redis.exceptions.NoScriptError):
                 self._open()
                 raise InboxExchanged(f"the inbox in {self._place} was emptied or exchanged, or started anew") from None
             text = str(error).rstrip(".").replace(str(self._password or "\0"), "***")

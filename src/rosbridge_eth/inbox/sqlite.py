@@ -130,7 +130,7 @@ class SqliteInbox(Inbox):
         rows = self._read("SELECT number, digest FROM head WHERE tk = ? AND stream = ?", tk, stream)
         return Head(int.from_bytes(rows[0][0], "big"), rows[0][1]) if rows else None
 
-    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head], now: float) -> None:
+    def raise_heads(self, tk: bytes, heads: Mapping[bytes, Head]) -> None:
         def write() -> None:
             for stream, head in heads.items():
                 self._raise(tk, stream, *head)

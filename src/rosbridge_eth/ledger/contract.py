@@ -436,12 +436,6 @@ class Ledger:
         """AllocETH: to a registered robot's account, up to BALANCE_LIMIT."""
         return self.transact(operator, "allocETH", account, value=wei)
 
-    def offer_operator(self, operator: LocalAccount, account: str) -> Receipt:
-        return self.transact(operator, "offerOperator", account)
-
-    def accept_operator(self, account: LocalAccount) -> Receipt:
-        return self.transact(account, "acceptOperator")
-
     def _send_and_wait(
         self, account: LocalAccount, data: bytes, value: int, gas: int, wait: float, *, creates: bool = False
     ) -> Receipt:

@@ -235,7 +235,7 @@ class Submitter:
         tk, standing, after, _ = work
         whole = self._inbox.head(tk, ALL) is not None
         if after is None and not whole:
-            self._inbox.raise_heads(tk, {ALL: Head(0, contract.NOTHING)}, now)
+            self._inbox.raise_heads(tk, {ALL: Head(0, contract.NOTHING)})
         if after is None or whole:
             return self._inbox.rows(tk, after, ROWS)
         rows = self._inbox.rows(tk, after, 8 * IN_FLIGHT)
@@ -276,14 +276,14 @@ class Submitter:
         self.counts["walks"] += 1
         if not walk.newest or keccak(walk.newest[0]) != standing.tail:
             raise _Hold("the chain changed while it was read")
-        self._inbox.raise_heads(tk, walk.heads, now)  # from here on, nothing of it is taken
+        self._inbox.raise_heads(tk, walk.heads)  # from here on, nothing of it is taken
         after = self._inbox.find(tk, standing.tail)
         if after is None or any(row.digest in walk.on_chain for row in self._inbox.rows(tk, after, 2**31)):
             try:
-                tail, *before = [Chunk.parse(encoded) for encoded in walk.newest]
+                front = [Chunk.parse(encoded) for encoded in reversed(walk.newest)]
             except Malformed as error:
                 raise _Hold(f"what another program wrote is on the chain: {error}") from error
-            self._inbox.rebase(tk, tail, walk.on_chain, {}, now, before[::-1])
+            self._inbox.rebase(tk, front, walk.on_chain, now)
             account.flights = []
             self.counts["rebases"] += 1
         if oldest is not None and oldest.digest not in walk.on_chain:

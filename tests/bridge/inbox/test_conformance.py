@@ -91,7 +91,7 @@ def test_a_number_is_above_the_head_or_it_is_not_taken_and_a_new_stream_may_begi
     assert inbox.head(A, OTHER) == Head(2**64 - 1, chunk(2**64 - 1, OTHER).header.digest)
     assert (inbox.head(A, b"?" * 16), inbox.head(B, STREAM)) == (None, None)
     assert put(inbox, [chunk(5)], B) == [STORED]  # another robot's stream of the same name is another stream
-    assert set(inbox.robots()) == {A, B}
+    assert set(inbox.sizes()) == {A, B}
 
 
 def test_the_head_outlives_the_rows(inbox):
@@ -277,7 +277,8 @@ def test_rows_that_are_on_the_chain_go_and_the_tail_stands_in_front_of_the_other
     put(inbox, made[:3])
     inbox.confirm(A, position_of(inbox, made[1]), T0)
     heads = {STREAM: Head(5, made[5].header.digest), OTHER: Head(9, b"9" * 32)}
-    inbox.rebase(A, made[5], [one.header.digest for one in made[1:5]], heads, T0 + 1)
+    inbox.raise_heads(A, heads)
+    inbox.rebase(A, [made[5]], [one.header.digest for one in made[1:5]], T0 + 1)
     assert held(inbox) == [made[5], made[0]]
     assert rows(inbox)[0].taken_at == T0 + 1
     assert inbox.find(A, Web3.keccak(made[5].encoded)) == rows(inbox)[0].position
@@ -291,7 +292,7 @@ def test_rows_that_are_on_the_chain_go_and_the_tail_stands_in_front_of_the_other
 
 def test_an_inbox_that_was_deleted_gets_the_tail_alone(inbox):
     tail = chunk(7)
-    inbox.rebase(A, tail, [], {}, T0)
+    inbox.rebase(A, [tail], [], T0)
     assert held(inbox) == [tail]
     assert put(inbox, [chunk(6), chunk(7), chunk(8)]) == [KNOWN, KNOWN, STORED]
     inbox.confirm(A, position_of(inbox, tail), T0)
@@ -303,7 +304,7 @@ def test_a_chain_without_chunks_leaves_all_rows_and_confirms_none(inbox):
     made = list(chain(3))
     put(inbox, made)
     inbox.confirm(A, position_of(inbox, made[2]), T0)
-    inbox.rebase(A, None, [], {}, T0)
+    inbox.rebase(A, [], [], T0)
     assert held(inbox) == made
     assert inbox.state(A).confirmed is None
 
@@ -311,7 +312,7 @@ def test_a_chain_without_chunks_leaves_all_rows_and_confirms_none(inbox):
 def test_a_tail_that_is_there_in_the_other_form_is_replaced_by_the_one_of_the_chain(inbox):
     made = list(chain(3))
     put(inbox, made)
-    inbox.rebase(A, dropped(made[1]), [made[0].header.digest], {}, T0)
+    inbox.rebase(A, [dropped(made[1])], [made[0].header.digest], T0)
     assert held(inbox) == [dropped(made[1]), made[2]]
     assert inbox.find(A, Web3.keccak(made[1].encoded)) is None
 
@@ -320,7 +321,7 @@ def test_rebase_twice_is_as_once_and_a_fork_stays_behind_the_tail(inbox):
     made = list(chain(3))
     put(inbox, [made[0], chunk(1, variant=1)])
     for _ in range(2):
-        inbox.rebase(A, made[1], [made[0].header.digest], {}, T0)
+        inbox.rebase(A, [made[1]], [made[0].header.digest], T0)
         assert [one.header.digest for one in held(inbox)] == [
             made[1].header.digest, chunk(1, variant=1).header.digest,
         ]  # fmt: skip
@@ -329,9 +330,9 @@ def test_rebase_twice_is_as_once_and_a_fork_stays_behind_the_tail(inbox):
 def test_what_a_reorganisation_may_take_back_becomes_rows_too(inbox):
     made = list(chain(9))
     put(inbox, made[6:])
-    inbox.rebase(A, made[6], [one.header.digest for one in made[:7]], {}, T0, before=made[3:6])
+    inbox.rebase(A, made[3:7], [one.header.digest for one in made[:7]], T0)
     assert held(inbox) == made[3:]
-    inbox.rebase(A, made[2], [], {}, T0, before=made[:2])
+    inbox.rebase(A, made[:3], [], T0)
     assert held(inbox) == made
     assert put(inbox, made) == [KNOWN] * 9
     assert put(inbox, [chunk(9)]) == [STORED]
@@ -342,7 +343,8 @@ def test_a_long_history_is_no_obstacle(inbox):
     heads = {n.to_bytes(16, "big"): Head(n, bytes(32)) for n in range(1, 10_000)}
     on_chain = [n.to_bytes(32, "big") for n in range(50_000)]
     put(inbox, [chunk(n, size=0) for n in range(3000)])
-    inbox.rebase(A, chunk(2999, size=0), on_chain, heads, T0)
+    inbox.raise_heads(A, heads)
+    inbox.rebase(A, [chunk(2999, size=0)], on_chain, T0)
     assert (len(rows(inbox)), inbox.head(A, (9999).to_bytes(16, "big"))) == (3000, Head(9999, bytes(32)))
     assert [one.header.number for one in held(inbox)[:2]] == [2999, 0]
     inbox.confirm(A, rows(inbox)[-1].position, T0)
@@ -352,8 +354,8 @@ def test_a_long_history_is_no_obstacle(inbox):
 
 def test_heads_are_raised_and_never_lowered(inbox):
     put(inbox, chain(3))
-    inbox.raise_heads(A, {STREAM: Head(1, b"1" * 32), OTHER: Head(0, b"0" * 32)}, T0)
-    inbox.raise_heads(B, {STREAM: Head(4, b"4" * 32)}, T0)
+    inbox.raise_heads(A, {STREAM: Head(1, b"1" * 32), OTHER: Head(0, b"0" * 32)})
+    inbox.raise_heads(B, {STREAM: Head(4, b"4" * 32)})
     assert inbox.head(A, STREAM) == Head(2, chunk(2, previous=held(inbox)[2].header.previous).header.digest)
     assert inbox.head(A, OTHER) == Head(0, b"0" * 32)
     assert put(inbox, [chunk(3), chunk(4), chunk(5)], B) == [KNOWN, DIFFERENT, STORED]
@@ -368,7 +370,7 @@ def test_the_state_is_what_was_set(inbox):
     assert inbox.state(A) == RobotState(None, "no money ⛽", b"\0\xff" * 16)
     inbox.set_state(A, hold=None)
     assert inbox.state(A) == RobotState(None, None, b"\0\xff" * 16)
-    assert inbox.robots() == [A]
+    assert list(inbox.sizes()) == [A]
     with pytest.raises(ValueError, match="nonsense"):
         inbox.set_state(A, nonsense=1)
 
@@ -444,7 +446,7 @@ def test_the_inbox_of_another_contract_is_refused_or_apart(backend):
     except StoreError as error:
         assert "another contract" in str(error)
     else:
-        assert (rows(other), other.robots()) == ([], [])
+        assert (rows(other), list(other.sizes())) == ([], [])
         other.close()
     inbox.close()
 
@@ -470,7 +472,7 @@ def test_an_exchanged_store_is_told_although_there_is_nothing_to_take(backend):
     with pytest.raises(InboxExchanged):
         inbox.append([], 0.0)
     assert inbox.append([], 0.0) == []
-    assert inbox.robots() == []
+    assert list(inbox.sizes()) == []
     inbox.close()
 
 
@@ -561,9 +563,9 @@ def heal(inbox: Inbox, tk: bytes, on_chain: list[bytes], now: float) -> int | No
         for header in past:
             if header.stream not in heads or heads[header.stream].number < header.number:
                 heads[header.stream] = Head(header.number, header.digest)
-        inbox.raise_heads(tk, heads, now)
-        *before, tail = [Chunk.parse(one) for one in on_chain[-UNCONFIRMED:]]
-        inbox.rebase(tk, tail, [header.digest for header in past], heads, now, before)
+        inbox.raise_heads(tk, heads)
+        front = [Chunk.parse(one) for one in on_chain[-UNCONFIRMED:]]
+        inbox.rebase(tk, front, [header.digest for header in past], now)
         position = inbox.find(tk, Web3.keccak(on_chain[-1]))
     return position
 
@@ -713,7 +715,7 @@ class Model(RuleBasedStateMachine):
         mine = self.rows.get(tk, [])
         on_chain = {one.header.digest for one in mine if data.draw(st.booleans())}
         tail = chunk(number, b"t" * 16, size=0)
-        self.inbox.rebase(tk, tail, on_chain, {}, T0)
+        self.inbox.rebase(tk, [tail], on_chain, T0)
         self.rows[tk] = [tail] + [one for one in mine if one.header.digest not in {*on_chain, tail.header.digest}]
         self.confirmed[tk] = None
         head = self.heads.get((tk, b"t" * 16))

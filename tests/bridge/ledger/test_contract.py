@@ -101,7 +101,7 @@ def test_registration_needs_a_name_and_an_account(bare: Ledger):
         lambda ledger: ledger.replace_registration(ROBOT, TK, ROBOT.address, b""),
         lambda ledger: ledger.revoke_robot(ROBOT, TK),
         lambda ledger: ledger.alloc_eth(ROBOT, ROBOT.address, 0),
-        lambda ledger: ledger.offer_operator(ROBOT, ROBOT.address),
+        lambda ledger: ledger.transact(ROBOT, "offerOperator", ROBOT.address),
     ],
 )
 def test_only_the_operator_may(made: Ledger, call: Callable[[Ledger], object]):
@@ -168,15 +168,15 @@ def test_a_robot_without_money_cannot_write(bare: Ledger):
 
 def test_the_office_changes_hands_when_it_is_accepted(made: Ledger):
     with refused("NotOffered", ROBOT.address):
-        made.accept_operator(ROBOT)
-    made.offer_operator(OPERATOR, OTHER.address)
+        made.transact(ROBOT, "acceptOperator")
+    made.transact(OPERATOR, "offerOperator", OTHER.address)
     assert made.operator() == OPERATOR.address
-    made.accept_operator(OTHER)
+    made.transact(OTHER, "acceptOperator")
     assert made.operator() == OTHER.address
     with refused("NotOperator", OPERATOR.address):
         made.revoke_robot(OPERATOR, TK)
     with refused("NotOffered", OTHER.address):
-        made.accept_operator(OTHER)
+        made.transact(OTHER, "acceptOperator")
 
 
 # ---------------------------------------------------------------------- chunks
@@ -302,10 +302,10 @@ def test_blocks_have_numbers_and_times(made: Ledger):
 def test_a_transaction_that_another_one_overtakes_is_sent_with_the_next_nonce(made: Ledger):
     """Two processes that use the operator's account at once."""
     real, stale = made.nonces, made.nonces([OPERATOR.address])
-    made.offer_operator(OPERATOR, OTHER.address)
+    made.transact(OPERATOR, "offerOperator", OTHER.address)
     answers = iter([stale])
     made.nonces = lambda accounts: next(answers, None) or real(accounts)  # type: ignore[method-assign]
-    assert made.offer_operator(OPERATOR, ROBOT.address).succeeded
+    assert made.transact(OPERATOR, "offerOperator", ROBOT.address).succeeded
 
 
 def test_every_function_event_and_error_is_on_the_page():
