@@ -250,6 +250,8 @@ class RedisInbox(Inbox):
                 pipe.evalsha(_script()[1], 1, self._prefix, operation, self.id, self._run_id, tk.hex(), *arguments)
             answers: list[Any] = pipe.execute(raise_on_error=False)
             for answer in answers:
+                if isinstance(answer, redis.exceptions.NoScriptError):  # `_open` gave it one: it was started anew
+                    raise redis.ResponseError("EXCHANGED")
                 if isinstance(answer, Exception):
                     raise answer
         return answers
@@ -260,8 +262,7 @@ class RedisInbox(Inbox):
         try:
             yield
         except redis.RedisError as error:
-            # Redis knows the script from `_open`; one that does not was started anew.
-            if "EXCHANGED" in str(error) or isinstance(error, redis.exceptions.NoScriptError):
+            if "EXCHANGED" in str(error):
                 self._open()
                 raise InboxExchanged(f"the inbox in {self._place} was emptied or exchanged, or started anew") from None
             text = str(error).rstrip(".").replace(str(self._password or "\0"), "***")
