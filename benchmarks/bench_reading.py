@@ -80,7 +80,7 @@ def kept(chunks: int, folder: Path) -> None:
     ):
         took = -time.process_time()
         cache = open_cache(folder, NAME, log, reader, trust)
-        found = sum(1 for _ in cache.records(choice))
+        found = sum(1 for _ in cache.records(choice, set()))
         cache.close()
         took += time.process_time()
         print(f"{took:8.2f} s: {name}, {found:,} records of {cache.progress.records:,}")

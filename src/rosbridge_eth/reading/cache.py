@@ -19,8 +19,8 @@ import secrets
 import sqlite3
 import sys
 from collections import defaultdict
-from collections.abc import Iterator
-from itertools import groupby
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -44,6 +44,7 @@ else:
 MAX_CHUNKS: Final = 256
 MAX_BYTES: Final = 4 << 20
 """A segment, which memory holds whole, is closed at so many chunks or bytes of lines."""
+MAX_TOPICS: Final = 1_000
 _STATE, _SEGMENT, _PART = range(3)
 _PARTS: Final = 1 << 20  # what a segment may have: one for each line of its chunks
 _NONCE: Final = 12
@@ -62,7 +63,6 @@ class Cache:
         self._path, self._key, self._gcm = path, key, sm4.SM4GCM(key)
         self.progress, self.links = Progress(), Links()
         self.block, self.hash, self.next_block = 0, b"", 0
-        self._directory: dict[int, list[tuple[str, int, int]]] = {}
         self._keeping, self._linked = True, 0
         self._begin_segment()
         os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
@@ -77,16 +77,22 @@ class Cache:
             raise
 
     def _load(self) -> None:
-        for (first,) in self._db.execute("SELECT id FROM row WHERE kind = ? ORDER BY id", [_SEGMENT]).fetchall():
-            parts, links = self._get(_SEGMENT, first).split(b"\n", 1)
-            self._directory[first] = orjson.loads(parts)
+        kept = False
+        for _, _, links in self._segments():
             self.links.digests.frombytes(links[: len(links) // 2])
             self.links.indices.frombytes(links[len(links) // 2 :])
-        if self._directory:
+            kept = True
+        if kept:
             state, progress = self._get(_STATE, 0).split(b"\n", 1)
             self.block, hash_, self.next_block = orjson.loads(state)
             self.hash, self.progress = bytes.fromhex(hash_), _PROGRESS.validate_json(progress)
         self._linked = len(self.links.digests)
+
+    def _segments(self) -> Iterator[tuple[int, list[tuple[str, int, int]], bytes]]:
+        """The first chunk of each, topic and times of each of its parts, and its links."""
+        for (first,) in self._db.execute("SELECT id FROM row WHERE kind = ? ORDER BY id", [_SEGMENT]).fetchall():
+            parts, links = self._get(_SEGMENT, first).split(b"\n", 1)
+            yield first, orjson.loads(parts), links
 
     def close(self) -> None:
         self._db.close()
@@ -143,29 +149,32 @@ class Cache:
 
     # --- reading
 
-    def topics(self) -> set[str]:
-        return {topic for parts in self._directory.values() for topic, _, _ in parts}
+    def records(self, choice: Choice, topics: set[str]) -> Iterator[ProvenRecord]:
+        """What was kept before this reading, in the order of the log; with `at_ns` no more than is needed of it.
 
-    def records(self, choice: Choice) -> Iterator[ProvenRecord]:
-        """What was kept before this reading, in the order of the log; with `at_ns` no more than is needed of it."""
-        wanted = [
-            (first, n, part[0])
-            for first, parts in self._directory.items()
-            for n, part in enumerate(parts, 1)
-            if choice.wants(*part)
-        ]
-        if choice.at_ns is not None:
-            last = {topic: first for first, _, topic in wanted}
-            wanted = [each for each in wanted if each[0] == last[each[2]]]
-        for first, parts in groupby(wanted, key=itemgetter(0)):
+        topics: to this is added what there is, chosen or not.
+        """
+        for first, parts in self._wanted(choice, topics):
             places = [
                 Place(chunk, bytes.fromhex(stream), number, bytes.fromhex(digest), block, time, bytes.fromhex(hash_))
                 for chunk, stream, number, digest, block, time, hash_ in orjson.loads(self._get(_PART, first * _PARTS))
             ]
-            rows = [row for _, n, topic in parts for row in self._rows(first * _PARTS + n, topic, choice)]
+            rows = [row for n, topic in parts for row in self._rows(first * _PARTS + n, topic, choice)]
             for place, number, line, definition in sorted(rows, key=itemgetter(0, 1)):
                 content = MessageLine._make(orjson.loads(line).values())
                 yield ProvenRecord(places[place], number, line, content, definition)
+
+    def _wanted(self, choice: Choice, topics: set[str]) -> Iterator[tuple[int, list[tuple[int, str]]]]:
+        """Of each segment, the parts in which something may be wanted; with `at_ns` of each topic the last segment."""
+        last: dict[str, tuple[int, list[tuple[int, str]]]] = {}
+        for first, parts, _ in self._segments():
+            add_topics(topics, (topic for topic, _, _ in parts))
+            wanted = [(n, part[0]) for n, part in enumerate(parts, 1) if choice.wants(*part)]
+            if choice.at_ns is None and wanted:
+                yield first, wanted
+            elif choice.at_ns is not None:
+                last |= {topic: (first, [each for each in wanted if each[1] == topic]) for _, topic in wanted}
+        yield from last.values()
 
     def _rows(self, id_: int, topic: str, choice: Choice) -> Iterator[tuple[int, int, bytes, TypeLine | None]]:
         head, *lines = zstd.decompress(self._get(_PART, id_)).split(b"\n")
@@ -207,6 +216,12 @@ def open_cache(folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust
     except (sqlite3.Error, OSError) as error:
         log.warning("%s: what is read is not kept: %s", path, error)
         return None
+
+
+def add_topics(known: set[str], more: Iterable[str]) -> None:
+    """For a person who named a topic that is not there: MAX_TOPICS at most, whatever a log holds."""
+    if len(known) < MAX_TOPICS:
+        known.update(islice(more, MAX_TOPICS))
 
 
 def _span(records: list[ProvenRecord]) -> tuple[int, int]:

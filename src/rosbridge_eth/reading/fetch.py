@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
-from rosbridge_eth.reading.cache import Cache, open_cache
+from rosbridge_eth.reading.cache import Cache, add_topics, open_cache
 from rosbridge_eth.reading.verdict import Bookmarks, Verdict, shown
 from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Choice, ProvenChunk, ProvenRecord, Verifier
 from smcrypto import sm2
@@ -40,10 +40,9 @@ class Reading:
 
     def _records(self, choice: Choice) -> Iterator[ProvenRecord]:
         if self.kept is not None:
-            self.topics.update(self.kept.topics())
-            yield from self.kept.records(choice)
+            yield from self.kept.records(choice, self.topics)
         for chunk in self.chunks:
-            self.topics.update(record.content.topic for record in chunk.records)
+            add_topics(self.topics, (record.content.topic for record in chunk.records))
             yield from chunk.records
 
     def verdict(self) -> Verdict:

@@ -440,12 +440,7 @@ class Curves:
 
     def write(self, record: ProvenRecord) -> None:
         for field_, path in self._paths.items():
-            value: Any = record.content.data
-            for name in path:
-                if isinstance(value, list):
-                    value = value[int(name)] if name.isdigit() and int(name) < len(value) else None
-                else:
-                    value = value.get(name) if isinstance(value, dict) else None
+            value = _at(record.content.data, path)
             key = field_, record.content.topic
             if type(value) in (int, float, bool) and (key in self.curves or len(self.curves) < MAX_TRACKS):
                 curve = self.curves.setdefault(key, _Points(lambda a, b: (a[0], min(a[1], b[1]), max(a[2], b[2]))))
@@ -486,12 +481,20 @@ def _figure(path: Path, width: float, height: float) -> Iterator[Any]:
 def _position(data: Mapping[str, Any]) -> tuple[float, float] | None:
     """Of Odometry, PoseStamped, Pose, Point and what is built like them."""
     for path in (("pose", "pose", "position"), ("pose", "position"), ("position",), ("point",), ()):
-        value: Any = data
-        for name in path:
-            value = value.get(name) if isinstance(value, dict) else None
+        value = _at(data, path)
         if isinstance(value, dict) and _is_distance(value.get("x")) and _is_distance(value.get("y")):
             return float(value["x"]), float(value["y"])
     return None
+
+
+def _at(value: Any, path: Sequence[str]) -> Any:
+    """What is there in a record's data, or None; an array's element by its number."""
+    for name in path:
+        if isinstance(value, list):
+            value = value[int(name)] if name.isdecimal() and int(name) < len(value) else None
+        else:
+            value = value.get(name) if isinstance(value, dict) else None
+    return value
 
 
 def _is_distance(value: Any) -> bool:

@@ -299,3 +299,15 @@ def test_a_full_disk_ends_the_keeping_and_not_the_reading(chain, tmp_path, caplo
     assert "disk is full" in caplog.text
     assert numbers(read(chain, tmp_path)[0]) == list(range(40))
     assert caching.open_cache(tmp_path / "proven", NAME, LOG, reader().encryption_key, Trust([authority().certificate]))
+
+
+def test_of_endlessly_many_topics_some_are_remembered(tmp_path, monkeypatch):
+    monkeypatch.setattr(caching, "MAX_TOPICS", 5)
+    pen = Pen()
+    chunks = [pen.write(*(message(n, f"/t{n}") for n in range(at, at + 10))) for at in range(0, 100, 10)]
+    chain = Chain(events(chunks, 1), 20 + MARGIN)
+    for _ in range(2):
+        found, reading = read(chain, tmp_path)
+        assert numbers(found) == list(range(100))
+        assert len(reading.topics) == 5
+        assert numbers(read(chain, tmp_path, Choice("/t77"))[0]) == [77]
