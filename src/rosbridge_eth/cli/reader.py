@@ -89,7 +89,8 @@ def read(
     picture = outputs.Curves(field) if field else outputs.Trajectory()
     chosen = 0
     with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said), ExitStack() as files:
-        sinks: list[Any] = [files.enter_context(outputs.bag(bag)).write] if bag is not None else []
+        made = None if bag is None else files.enter_context(outputs.bag(bag))
+        sinks: list[Any] = [] if made is None else [made.write]
         if table is not None:
             sinks.append(files.enter_context(outputs.table(table)).write)
         if plot is not None:
@@ -103,6 +104,9 @@ def read(
         said |= {"chosen": chosen}
     if json:
         print_json(said)
+    if made is not None:
+        of = made.summary
+        talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
     if topic is not None and chosen == 0 and topic not in reading.topics:
         there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
         talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")

@@ -13,7 +13,7 @@ import pytest
 from bridge.chunks import chain as chunk_chain
 from bridge.operations.conftest import PASSWORD, Place
 from rosbridge_eth import chunk
-from rosbridge_eth.capture import Capture, TopicRule
+from rosbridge_eth.capture import Capture, TopicRule, definition_line
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.identity import load_identity
@@ -72,9 +72,9 @@ def written(
 def replayed(place: Place, keys: Keyring, without: int | None = None) -> None:
     """The sample bag on the chain, but for one message."""
     capture, source = Capture([TopicRule("**")], source_kind="bag"), BagSource(sample_bag(), Selection(["**/odom"]))
-    lines = [found.line for raw in source.messages() if (found := capture.process(raw, raw.received_ns))]
+    found = [one for raw in source.messages() if (one := capture.process(raw, raw.received_ns))]
     source.close()
-    lines = [line for n, line in enumerate(lines) if n != without]
+    lines = [definition_line(found[0].decoder), *(one.line for n, one in enumerate(found) if n != without)]
     owner, _ = load_identity(place.path / "reader", b"the reader's own words")
     written(place, keys, owner.encryption_key.public_key, [STREAM_LINE, *lines])
 

@@ -28,11 +28,14 @@ def test_every_output_comes_of_one_reading(place: Place, keys: Keyring, capsys: 
     field = ("--plot", "x.png", "--field", "pose.pose.position.x", "--field", "twist.twist.linear.x")
     outputs = ("--bag", "o.mcap", "--table", "o.parquet", *field, "--json")
     assert run([*READ, *outputs]) == 0
-    said = json.loads(capsys.readouterr().out)
+    shown = capsys.readouterr()
+    said = json.loads(shown.out)
+    assert "o.mcap: 300 whole messages, 0 with fields left out, 0 as JSON" in shown.err
     assert (said["sound"], said["records"], said["chosen"]) == (True, 300, 300)
     table = parquet.read_table("o.parquet")
     assert table.num_rows == 300
-    assert str(table.schema.field("received").type) == "timestamp[ns, tz=UTC]"
+    for column in ("received", "header.stamp"):
+        assert str(table.schema.field(column).type) == "timestamp[ns, tz=UTC]"
     assert str(table.schema.field("pose.covariance").type) == "list<element: double>"
     assert place.path.joinpath("x.png").read_bytes().startswith(b"\x89PNG")
     assert place.path.joinpath("o.mcap").stat().st_size > 10_000
