@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
@@ -100,9 +101,18 @@ def test_certificates_do_not_change_and_can_be_pickled() -> None:
     with pytest.raises(AttributeError):
         CERTIFICATE.subject = Name()  # type: ignore[misc]
     assert pickle.loads(pickle.dumps(CERTIFICATE)) == CERTIFICATE
-    for kind in (Certificate, CertificateSigningRequest):
+    for thing in (CERTIFICATE, CSR, ROOT.crl()):
+        with pytest.raises(AttributeError):
+            thing.signature = b""  # type: ignore[misc]
         with pytest.raises(TypeError):
-            kind()
+            type(thing)()
+        with pytest.raises(TypeError):  # what exists has been read from its DER
+            dataclasses.replace(thing, signature=b"")
+
+
+def test_a_copied_request_is_to_be_verified_again() -> None:
+    again = pickle.loads(pickle.dumps(CSR))
+    assert again == CSR and CSR.verified and not again.verified
 
 
 def test_serial_numbers_are_random_positive_and_fit_20_bytes() -> None:
