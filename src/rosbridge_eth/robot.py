@@ -22,7 +22,7 @@ from pathlib import Path
 from socket import socket as Socket
 from typing import TypeVar
 
-from rosbridge_eth.capture import Capture, Captured, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
@@ -61,39 +61,22 @@ def clock_synchronised() -> bool:
 
 
 class Robot:
-    """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called.
-
-    on_captured: called with each record, in the loop's thread.
-    """
+    """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
 
     def __init__(
-        self,
-        *,
-        source: Source,
-        capture: Capture,
-        writer: LogWriter,
-        spool: Spool,
-        client: Client,
-        socket: Socket,
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, socket: Socket,
         sender: Sender,
-        on_captured: Callable[[Captured], None] = lambda record: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.capture, self.writer, self.spool = capture, writer, spool
         self.client, self.sender, self.loop = client, sender, UdpLoop(client, socket, self.handle)
         sender.begin_stream = self.begin_stream
-        self.source = source
-        self.captured = 0
-        self.chunks = 0
-        self._on_captured = on_captured
+        self.source, self.captured, self.chunks = source, 0, 0
         self._ring: deque[RawMessage] = deque()
-        self._room = threading.Event()
-        self._stop = threading.Event()
-        self._source_ended = threading.Event()
+        self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
-        self._spool_at = float("-inf")
-        self._losses_at = float("-inf")
-        self._synchronised, self._synchronised_at = False, float("-inf")
+        self._spool_at = self._losses_at = self._synchronised_at = float("-inf")
+        self._synchronised = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
         self.spool_trouble = Trouble(log, "the spool")
@@ -135,7 +118,7 @@ class Robot:
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 self._spool_or(None, partial(self.sender.send, now))
                 on_turn()
-                if finished and not self._unspooled and self._spool_or(False, self._idle):
+                if finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
                     break
                 self.loop.step(self._wait(now, finished))
             else:
@@ -189,7 +172,6 @@ class Robot:
             if record is not None:
                 self.writer.add(record.line, now, (raw.type_name, definition_line(raw.decoder)))
                 self.captured += 1
-                self._on_captured(record)
         if len(self._ring) < RING // 2:
             self._room.set()
         if now - self._losses_at >= LOSSES_EVERY:
@@ -229,15 +211,12 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.statistics.connected and not self._spool_or(True, self._idle):
+        while self.sender.statistics.connected and not self._spool_or(True, lambda: self.sender.idle):
             if (now := time.monotonic()) >= deadline:
                 break
             self._spool_chunks([], now)
             self._spool_or(None, partial(self.sender.send, now))
             self.loop.step(0.02)
-
-    def _idle(self) -> bool:
-        return self.sender.idle
 
     def handle(self, event: Event) -> None:
         """Take one event of the client. What the spool cannot note at this moment the server says again."""
@@ -301,13 +280,7 @@ def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certi
     return keys
 
 
-def open_robot(
-    home: RobotHome,
-    config: RobotConfig,
-    password: bytes,
-    *,
-    on_captured: Callable[[Captured], None] = lambda record: None,
-) -> Robot:
+def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     """The robot of this home, ready to `run`. Raises ConfigError, IdentityError, SourceError, StoreError."""
     end = home.bridge()
     identity, roots = load_identity(home.identity, password)
@@ -336,9 +309,8 @@ def open_robot(
     sender = Sender(client, spool, channel=config.channel, on_server_time=home.raise_clock_floor)
     socket, address = client_socket(config.server or parse_address(end.server_address))
     robot = Robot(
-        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender,
-        on_captured=on_captured,
-    )  # fmt: skip
+        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender
+    )
     client.connect(address, now)
     return robot
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
@@ -42,7 +42,7 @@ TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an a
 FEW_DAYS = 7.0
 Figure = tuple[str, dict[str, str], float]
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
-             "chain_block": "block", "on_hold": "hold"}
+             "chain_block": "block", "on_hold": "hold", "waiting_chunks": "chunks", "waiting_seconds": "oldest"}
 """The server's figures of a robot, and what they are called here."""
 
 
@@ -126,16 +126,15 @@ def _running(report: Report, home: Path, expected: Collection[str], whose: str) 
     """What the running process of this home shows: its figures; in the report, the conditions that do not hold."""
     from rosbridge_eth import metrics
 
-    report["process"] = None
-    try:
-        holds = metrics.conditions(metrics.collected(home), expected, time.time())
-        if not any(holds[f"{process} runs"] for process in expected):
-            raise ValueError
-    except ValueError:
+    report["process"], found, holds = None, list[Figure](), dict[str, bool]()
+    with suppress(ValueError):  # nothing runs
+        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
+        found = metrics.figures(home)
+    if not any(holds.get(f"{process} runs") for process in expected):  # or what a killed one left
         report["unknown"].append(f"the {whose} does not run here: who is connected, rates and gas are not known")
         return []
     report["process"] = [name for name, so in holds.items() if not so]
-    return metrics.figures(home)
+    return found
 
 
 def _add_figures(report: Report, figures: Collection[Figure]) -> None:
@@ -144,13 +143,13 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
     for robot in report["robots"].values() if figures else ():
         robot |= {"connected": False, "address": None}
     for name, labels, value in sorted(figures, key=lambda figure: figure[2]):
-        robot = report["robots"].get(labels.get("robot"))
-        if robot is not None and name == "session_seen_seconds" and now - value < SEEN:
+        if (robot := report["robots"].get(labels.get("robot"))) is None:
+            continue
+        if name == "session_seen_seconds" and now - value < SEEN:
             robot |= {"connected": True, "address": labels["address"]}
-        elif robot is not None and name in ("waiting_chunks", "waiting_seconds"):
-            robot.setdefault("waiting", {})["chunks" if name == "waiting_chunks" else "oldest"] = value
-        elif robot is not None and name in _OF_ROBOT:
-            robot[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
+        elif name in _OF_ROBOT:
+            of = robot.setdefault("waiting", {}) if name.startswith("waiting_") else robot
+            of[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
 
 
 def _head(report: Report, ledger: Ledger) -> None:

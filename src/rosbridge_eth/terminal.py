@@ -80,7 +80,7 @@ def live(make: Callable[[], RenderableType]) -> Iterator[Callable[[], None]]:
     """At a terminal a picture that stays below all that is written to stderr, also by processes that are forked inside.
     Gives what brings it up to date, once a second at most. Without a terminal there is nothing, and it does nothing.
     """
-    if not errors.is_terminal or speaks_json():
+    if not os.isatty(2) or speaks_json():
         yield lambda: None
         return
     ours, (end, begin), due = os.dup(2), os.pipe(), [0.0]

@@ -27,14 +27,11 @@ if TYPE_CHECKING:
     from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Keyring, Ledger
 
-_CaPassphraseFile = Annotated[
-    Path | None, typer.Option(help="Of a CA kept apart, where it has a passphrase of its own.")
-]
+_CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
 _ReplaceOption = Annotated[bool, typer.Option("--replace", help="Take a used name over; the old one ends.")]
 _CompromisedOption = Annotated[
-    bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")
-]
+    bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -97,10 +94,9 @@ def up(
     chain: Annotated[str | None, typer.Option(help="A node of yours; without it, an anvil kept in the home.")] = None,
     listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
-    passphrase_file: PassphraseFile = None,
-    verbose: terminal.Verbose = 0,
+    passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
-) -> None:
+) -> None:  # fmt: skip
     """Everything an operator runs, in one: home, local chain, contract, server. For trying out and for small sites.
 
     What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
@@ -152,10 +148,9 @@ def init(
     server_name: Annotated[str, typer.Option(help="The name in the server's certificate.")] = "server",
     ca: Annotated[Path | None, typer.Option(help="Keep the CA in this folder, or use the one that is there.")] = None,
     mnemonic_file: Annotated[Path | None, typer.Option(help="Restore the accounts from these words.")] = None,
-    passphrase_file: PassphraseFile = None,
-    ca_passphrase_file: _CaPassphraseFile = None,
+    passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     reader_passphrase_file: _ReaderPassphraseFile = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make an operator's home: the CA, the server's identity, the seed of all accounts; and the reader `owner`."""
     from rosbridge_eth.administration import init_home
     from rosbridge_eth.ledger import Keyring
@@ -220,13 +215,10 @@ def deploy(
 def register(
     name: Annotated[str, typer.Argument(help="The robot's name: a-z, 0-9, '_', '.', '-'.")],
     request: Annotated[Path | None, typer.Argument(help="The request that `join --name` wrote on the robot.")] = None,
-    home: OperatorHomeOption = OPERATOR_HOME,
-    replace: _ReplaceOption = False,
-    compromised: _CompromisedOption = False,
-    passphrase_file: PassphraseFile = None,
-    ca_passphrase_file: _CaPassphraseFile = None,
+    home: OperatorHomeOption = OPERATOR_HOME, replace: _ReplaceOption = False, compromised: _CompromisedOption = False,
+    passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     password_file: terminal.PasswordFile = None,
-) -> None:
+) -> None:  # fmt: skip
     """Register a robot: its request becomes an account on the chain, certificates, and a bundle to carry back.
 
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
@@ -268,12 +260,9 @@ def register(
 def add_reader(
     name: Annotated[str, typer.Argument(help="The reader's name.")],
     to: Annotated[Path | None, typer.Option("--to", help="The reader's folder; without it, one of its name.")] = None,
-    home: OperatorHomeOption = OPERATOR_HOME,
-    replace: _ReplaceOption = False,
-    passphrase_file: PassphraseFile = None,
-    ca_passphrase_file: _CaPassphraseFile = None,
-    reader_passphrase_file: _ReaderPassphraseFile = None,
-) -> None:
+    home: OperatorHomeOption = OPERATOR_HOME, replace: _ReplaceOption = False, passphrase_file: PassphraseFile = None,
+    ca_passphrase_file: _CaPassphraseFile = None, reader_passphrase_file: _ReaderPassphraseFile = None,
+) -> None:  # fmt: skip
     """Make another reader; robots that are registered from now on seal for it too."""
     from rosbridge_eth import administration
 
@@ -291,9 +280,8 @@ def revoke(
     name: Annotated[str, typer.Argument(help="The name to revoke.")],
     home: OperatorHomeOption = OPERATOR_HOME,
     role: Annotated[Role, typer.Option(help="What it is.")] = Role.ROBOT,
-    compromised: _CompromisedOption = False,
-    passphrase_file: PassphraseFile = None,
-) -> None:
+    compromised: _CompromisedOption = False, passphrase_file: PassphraseFile = None,
+) -> None:  # fmt: skip
     """Revoke a name: the server closes its session at once, and the chain takes nothing from it any more."""
     from rosbridge_eth import administration
 
@@ -309,10 +297,9 @@ def revoke(
 
 
 def renew(
-    home: OperatorHomeOption = OPERATOR_HOME,
-    passphrase_file: PassphraseFile = None,
+    home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     ca_passphrase_file: _CaPassphraseFile = None,
-) -> None:
+) -> None:  # fmt: skip
     """Give the server new keys and certificates, before the old ones expire; then start the server again."""
     from rosbridge_eth.administration import renew_server
 
@@ -359,8 +346,7 @@ def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: Passphra
 
 
 def backup(
-    target: Annotated[Path, typer.Argument(help="A new folder.")],
-    home: terminal.AnyHomeOption = OPERATOR_HOME,
+    target: Annotated[Path, typer.Argument(help="A new folder.")], home: terminal.AnyHomeOption = OPERATOR_HOME
 ) -> None:
     """Copy a home, in use or not, into a new folder; keep it where its keys are safe."""
     from rosbridge_eth import administration
@@ -370,10 +356,9 @@ def backup(
 
 
 def passwd(
-    home: terminal.AnyHomeOption = OPERATOR_HOME,
-    passphrase_file: PassphraseFile = None,
+    home: terminal.AnyHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     new_passphrase_file: Annotated[Path | None, typer.Option(help="The new one, on the first line.")] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Put the keys of a home under another passphrase."""
     from rosbridge_eth.administration import change_passphrase
 
@@ -386,10 +371,9 @@ def passwd(
 def server(
     home: OperatorHomeOption = OPERATOR_HOME,
     workers: Annotated[int | None, typer.Option(min=1, max=64, help="Processes that share the port.")] = None,
-    passphrase_file: PassphraseFile = None,
-    verbose: terminal.Verbose = 0,
+    passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
-) -> None:
+) -> None:  # fmt: skip
     """Take chunks from robots and bring them onto the chain, until stopped."""
     log_to_stderr(log_format, verbose)
     _serve(*_opened(home, passphrase_file), {} if workers is None else {"workers": workers})
