@@ -1,6 +1,7 @@
 """The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
-Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none.
+Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none. While a
+server or robot runs, `.figures` leads to what it counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:
 

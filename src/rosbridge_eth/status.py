@@ -328,7 +328,7 @@ def _process(report: Report) -> list[tuple[str, object]]:
 
 
 def _robots(report: Report, *, money: bool = True) -> RenderableType:
-    columns, rows = ["robot", "session", "newest", "records/s", "waiting", "on chain", "gas"], []
+    columns, rows = ["robot", "session", "newest", "records/s", "waiting", "on chain", "Mgas"], []
     for name, robot in report["robots"].items():
         waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
         oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
@@ -336,7 +336,7 @@ def _robots(report: Report, *, money: bool = True) -> RenderableType:
         rows.append((
             name, (session or robot["address"]) if robot["in_force"] else "revoked", span(robot.get("newest")),
             _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
-            _figure(robot, "chunks", ".0f") + block, _figure(robot, "gas", ".3g"),
+            _figure(robot, "chunks", ".0f") + block, f"{robot['gas'] / 1e6:.2f}" if "gas" in robot else "?",
             *([_figure(robot, "eth", ".4f"), _figure(robot, "days_left", ".1f")] if money else []),
         ))  # fmt: skip
     title = "Robots: chunks that wait (how long) and that are on the chain (in which block the last)"

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -29,7 +30,10 @@ def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, requi
     assert found
     commands = [line.removeprefix("rosbridge-eth ").split() for line in found[1].splitlines()]
     assert [words[0] for words in commands] == ["up", "join", "register", "robot"]
-    with Terminal(tmp_path, *commands[0]) as up:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:  # other tests may have the usual port
+        free.bind(("127.0.0.1", 0))
+        door = "{}:{}".format(*free.getsockname())
+    with Terminal(tmp_path, *commands[0], "--listen", door) as up:
         up.answer("A passphrase for all of it: ", "open sesame")
         up.answer("(again): ", "open sesame")
         up.until("Listening on UDP")
