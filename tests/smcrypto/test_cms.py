@@ -394,3 +394,12 @@ def test_keys_are_sealed_and_opened() -> None:
 def test_what_is_no_sealed_key(altered: dict[str, bytes]) -> None:
     with pytest.raises(InvalidKey):
         sm2.PrivateKey.from_enveloped(sealed(**altered), KEY)
+
+
+def test_the_algorithm_of_an_enveloped_key_has_nothing_after_its_parameters() -> None:
+    members = der.only_sequence(OTHER.to_enveloped(KEY.public_key))
+    algorithm, rest = members.raw(), [members.raw() for _ in range(3)]
+    assert sm2.PrivateKey.from_enveloped(der.sequence(algorithm, *rest), KEY) == OTHER
+    longer = der.sequence(algorithm[2:] + der.null())
+    with pytest.raises(InvalidKey, match="left over"):
+        sm2.PrivateKey.from_enveloped(der.sequence(longer, *rest), KEY)
