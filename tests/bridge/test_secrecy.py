@@ -48,12 +48,14 @@ class Seen:
         handler.addFilter(lambda record: record.thread not in others)  # what another test left running is not this run
         logger = logging.getLogger(LOGGER)
         logger.addHandler(handler)
-        patch.setattr(logger, "level", logging.DEBUG)
+        level = logger.level
+        logger.setLevel(logging.DEBUG)  # which the loggers below it have to be told
         try:
             self.result: DemoResult = run_demo(
                 folder, sample_bag(), harm=Harm(loss=0.1, duplicate=0.05, reorder=0.05), on_datagram=datagrams.append
             )
         finally:
+            logger.setLevel(level)
             logger.removeHandler(handler)
         chain, self.chunks = self._chain()
         self.places = {
