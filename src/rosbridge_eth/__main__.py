@@ -20,7 +20,7 @@ def main() -> int:
             raise
         print(
             f"rosbridge-eth: the bridge needs the package {error.name}; install it with:"
-            " pip install 'pysmcrypto[bridge]' (in a checkout: pip install '.[bridge]')",
+            " pip install '.[bridge]' in a checkout, or with 'WHEEL[bridge]'",
             file=sys.stderr,
         )
         return 1

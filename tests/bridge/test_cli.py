@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import socket
 import subprocess
@@ -307,6 +308,19 @@ def test_an_account_is_exported_for_other_software(place: Place, capsys: Capture
     fails(capsys, ExitCode.CONFIG, "exists", "export", "operator", "operator.json", *ours)
     fails(capsys, ExitCode.IDENTITY, "`status` lists", "export", "robot_9", "x.json", *ours)
     assert not Path("x.json").exists()
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    script = "import sys; from rosbridge_eth.__main__ import main; sys.argv[0] = 'rosbridge-eth'; sys.exit(main())"
+
+    def complete(words: str) -> list[str]:
+        asked = {"_ROSBRIDGE_ETH_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
+                              env={**os.environ, **asked})  # fmt: skip
+        return done.stdout.split()
+
+    assert complete("rosbridge-eth st") == ["status"]
+    assert {"--home", "--follow", "--json"} <= {*complete("rosbridge-eth status --")}
 
 
 def test_without_the_bridge_packages_the_command_says_how_to_get_them() -> None:

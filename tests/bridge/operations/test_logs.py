@@ -5,7 +5,10 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -87,6 +90,19 @@ def test_verbosity_chooses_how_much_the_bridge_says_and_other_packages_stay_quie
     said = [line.split()[1] for line in stream.getvalue().splitlines() if "ours" in line]
     assert said == levels
     assert stream.getvalue().count("theirs") == 1
+
+
+def test_a_log_that_is_copied_and_cut_short_goes_on_at_its_beginning(tmp_path: Path):
+    """logrotate's copytruncate, of a file that the shell appends to."""
+    file = tmp_path / "log"
+    with file.open("a") as stream:
+        log_to(stream, LogFormat.JSON, 1)
+        log.info("before")
+        shutil.copy(file, tmp_path / "log.1")
+        os.truncate(file, 0)
+        log.info("after")
+    assert [json.loads(line)["event"] for line in file.read_text().splitlines()] == ["after"]
+    assert json.loads((tmp_path / "log.1").read_text())["event"] == "before"
 
 
 def test_trouble_is_said_at_each_change_and_so_is_its_end():
