@@ -85,7 +85,10 @@ def test_ros_1(place: Path, require: Callable[[str], str]):
     for program in ("rosmaster", "rosbag"):
         require(program)
     shutil.copy(sample_bag(), place / "robot_1.bag")
-    said = type_page("howto-ros1.md", place, ports={"11311": free_port()}, environment={"ROS_LOG_DIR": str(place)})
+    said = type_page(
+        "howto-ros1.md", place, ports={"11311": free_port()}, environment={"ROS_LOG_DIR": str(place)},
+        before="rosbridge-eth server 2> server.log &\nuntil grep -q Listening server.log; do sleep 0.2; done",
+    )
     captured = re.search(r"(\d+) records captured", said)
     assert captured and int(captured[1]) == 300, said[-3000:]
     assert (place / "recovered.bag").stat().st_size > 10_000
