@@ -28,7 +28,7 @@ from rosbridge_eth.writer import LogWriter
 
 BIRTH = datetime(2026, 1, 1, tzinfo=UTC)
 ROBOT_ADDRESS, SERVER_ADDRESS = ("192.0.2.2", 5000), ("192.0.2.1", 7410)
-SEEDS = range(int(os.environ.get("DELIVERY_SEEDS", "4")))
+SEEDS = range(int(os.environ.get("DELIVERY_SEEDS", "2")))
 BAD = Faults(loss=0.3, duplication=0.1, corruption=0.05, delay=0.02, jitter=0.05)
 LEDGER = bytes(range(32))
 STREAM_LINE = b'{"stream":{}}'

@@ -16,7 +16,7 @@ from bridge.load_script import load_script
 from rosbridge_eth import supervisor
 from rosbridge_eth.channel import ServerConfig
 
-SESSIONS, MESSAGES, WORKERS = 40, 10, 2
+SESSIONS, MESSAGES, WORKERS = 24, 5, 2
 load = load_script("load")
 
 

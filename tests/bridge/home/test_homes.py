@@ -43,7 +43,7 @@ def test_a_home_says_whose_it_is_and_no_other_command_takes_it(kind: HomeKind, t
 def test_what_is_no_home_says_how_to_make_one(tmp_path: Path) -> None:
     for ask, way in (
         (OperatorHome(tmp_path).require, "run `init --home"), (ReaderHome(tmp_path).require, "`reader NAME`"),
-        (RobotHome(tmp_path).bridge, "run `join BUNDLE --home"),
+        (RobotHome(tmp_path).bridge, "run `join --name NAME --home"),
     ):
         with pytest.raises(ConfigError, match=way):
             ask()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from eth.vm.forks import CancunVM, LondonVM, PragueVM
+from eth.vm.forks import LondonVM, PragueVM
 from eth_utils.crypto import keccak
 
 from bridge.ledger.world import ETH, KEYS
@@ -245,7 +245,7 @@ def test_robots_do_not_touch_each_other(made: Ledger):
     ("size", "count"),
     [(1, 1), (1, 100), (203, 1), (203, 200), (400, 100), (6_500, 15), (8_500, 11), (65_000, 1), (98_000, 1)],
 )
-@pytest.mark.parametrize("rules", [PragueVM, CancunVM, LondonVM])
+@pytest.mark.parametrize("rules", [PragueVM, LondonVM])
 def test_the_gas_formula_holds_on_the_evm(rules: type, size: int, count: int):
     """Since Prague calldata has a floor price; before, and with zeros, execution alone counts."""
     chain = EmbeddedChain({account.address: 100 * ETH for account in (OPERATOR, ROBOT, OTHER)}, rules=rules)

@@ -356,6 +356,26 @@ def test_an_inbox_that_is_deleted_under_it_is_noticed(world: World):
     world.run()
 
 
+def test_what_was_in_flight_is_sent_again_from_an_inbox_that_was_filled_anew(world: World):
+    """The same chunks stand at other places there."""
+    old = Pen()
+    old.restart()
+    world.take(old.chunks(2))
+    world.inbox.bury(world.pen.tk, None, "of a robot that was replaced")
+    world.take(world.pen.chunks(3))
+    world.turn()
+    before = [row.position for row in world.inbox.rows(world.pen.tk, None, 9)]
+    world.model.drop()
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{world.inbox_path}{suffix}").unlink(missing_ok=True)
+    with pytest.raises(InboxExchanged):
+        world.turn()
+    world.take(world.pen.written)
+    assert [row.position for row in world.inbox.rows(world.pen.tk, None, 9)] != before
+    world.run()
+    assert world.model.reverted == 0
+
+
 def test_an_old_copy_to_which_the_robot_sends_what_it_lacks(world: World):
     world.take(world.pen.chunks(10))
     old = copy_inbox(world, "old")

@@ -105,8 +105,9 @@ class Quick(LiveSource):
         return ()
 
     def _receive(self):
-        for number in range(10):
-            self._backlog.put(message("/a", number))
+        with self._backlog._changed:  # none is taken in between
+            for number in range(10):
+                self._backlog.put(message("/a", number))
         self.counts["/a", "received"] += 10
         self.counts["/a", "lost"] += 3
         self.counts["/b", "foreign"] += 1
