@@ -19,6 +19,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # 
 PAPER = {300: (2994, 2993, 186.34), 500: (4986, 4986, 249.88), 700: (6991, 6991, 370.29)}
 """By clients: received, on the chain, ms of decryption in 8 processes."""
 CHAINS = {"poa": "proof of authority", "pow": "proof of work"}
+PARTS = ("user", "server", "poa", "bridge-poa", "pow", "bridge-pow", "scale")
 Figures = Mapping[str, Any]
 
 
@@ -166,11 +167,14 @@ def _head(figures: Figures) -> str:
     rows = [(name, part["machine"]["processor"], part["machine"]["python"], part["machine"]["load"],
              f"{part['seconds'] / 60:.1f} min" + (" (--quick)" if part["quick"] else ""))
             for name, part in figures.items()]  # fmt: skip
+    missing = [name for name in PARTS if name not in figures]
+    absent = f" Not measured yet: {', '.join(missing)}." if missing else ""
     return f"""# The paper's evaluation, done again
 
 The system that this project implements was judged by its authors with tables and figures (Security and Communication
 Networks 2022, article 7206494) on a 10-core i9-10900KF at 3.7 GHz with 64 GB. This page has the same rows from this
-implementation. It is written by `python benchmarks/paper.py`, from the figures in [evaluation.json](evaluation.json).
+implementation. It is written by `python benchmarks/paper.py`, from the figures in
+[evaluation.json](evaluation.json).{absent}
 
 {table(["part", "processor", "Python", "load average before", "took"], rows)}
 
