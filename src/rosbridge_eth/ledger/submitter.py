@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 from eth_utils.crypto import keccak
@@ -331,12 +330,9 @@ class Submitter:
             self.counts["surprises"] += 1
         elif mined:
             account.careful = False
-        flown = [row.digest for batch in account.flights for row in batch.rows]
-        if flown == [row.digest for row in rows[: len(flown)]]:
-            there = iter(rows)  # the same chunks, maybe at other places: robots fill an inbox that was lost again
-            account.flights = [f._replace(rows=tuple(islice(there, len(f.rows)))) for f in account.flights]
-        else:
-            account.flights = []  # the rows are others now
+        flown = [(row.position, row.digest) for batch in account.flights for row in batch.rows]
+        if flown != [(row.position, row.digest) for row in rows[: len(flown)]]:
+            account.flights = []  # the rows are others now, or stand elsewhere: robots filled a lost inbox again
         if done or account.nonce is None:
             account.since = now
         account.nonce = latest
