@@ -30,9 +30,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import geth_network
 from eth_utils.crypto import keccak
 
+import geth_network
+from ports import free_port
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import NOTHING, Receipt, call_gas, set_data_gas
@@ -50,7 +51,7 @@ def network(kind: str, clients: int, period: int, dag: Path | None = None) -> It
     """The URLs of its nodes. As in the paper, ten accounts have 100 ETH each; the operator's is one of them."""
     with tempfile.TemporaryDirectory(prefix="interaction-") as folder:
         if kind == "anvil":
-            with Anvil.start(geth_network.free_ports(1)[0], block_time=period) as node:
+            with Anvil.start(free_port(), block_time=period) as node:
                 node.fund(KEYS.operator.address, 100)
                 for client in range(1, clients + 1):  # some of them are those that anvil makes rich
                     node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")

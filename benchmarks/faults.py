@@ -43,6 +43,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import rosbridge_eth
+from ports import free_port
 from rosbridge_eth.capture import Capture, MessageLine, TopicRule, parse_line
 from rosbridge_eth.chunk import Chunk, Header, robot_id
 from rosbridge_eth.config import load_server_config
@@ -100,18 +101,6 @@ def until(what: str, holds: Callable[[], bool], within: float = PATIENCE) -> Non
         if time.monotonic() > deadline:
             raise Stuck(f"{what}: not within {within:.0f} s")
         time.sleep(0.05)
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port below those that the kernel gives out by itself, so that nobody gets it before it is used."""
-    while True:
-        port = random.SystemRandom().randrange(20_000, 32_000)
-        with socket.socket(socket.AF_INET, kind) as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
 
 
 def family(pid: int) -> list[int]:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
-import socket
 import struct
 import subprocess
 import time
@@ -23,6 +21,8 @@ import requests
 from eth_account import Account
 from eth_keys.datatypes import PrivateKey
 from eth_utils.crypto import keccak
+
+from ports import free_port
 
 CHAIN_ID, EPOCH, GAS_LIMIT = 4711, 30_000, 30_000_000
 DIFFICULTY = 0x4CCC8  # of the paper's network by proof of work
@@ -59,21 +59,6 @@ def make_dag(folder: Path) -> None:
         subprocess.run([find_geth("ethash"), "makedag", "0", str(folder)], check=True, capture_output=True)
     next_seed = keccak(bytes(32))[:8].hex()
     (folder / f"full-R23-{next_seed}").write_bytes(struct.pack("<II", 0xBADDCAFE, 0xFEE1DEAD).ljust(4096, b"\0"))
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports below those that the kernel gives out by itself."""
-    found: list[int] = []
-    while len(found) < count:
-        port = random.SystemRandom().randrange(20_000, 32_000)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-        if port not in found:
-            found.append(port)
-    return found
 
 
 def new_key() -> PrivateKey:
@@ -113,7 +98,7 @@ class Node:
         self._options = options
         self._program, self._folder, self._signer = program, folder, signer
         self.signer = signer.public_key.to_checksum_address()
-        self.http_port, self._peer_port, self._engine_port = free_ports(3)
+        self.http_port, self._peer_port, self._engine_port = (free_port() for _ in range(3))
         self.url = f"http://127.0.0.1:{self.http_port}"
         # The node's name in the network is a public key too; the signer's serves.
         self.enode = f"enode://{signer.public_key.to_hex()[2:]}@127.0.0.1:{self._peer_port}?discport=0"

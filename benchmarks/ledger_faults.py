@@ -42,9 +42,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import geth_network
 import requests
 
+import geth_network
+from ports import free_port
 from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
 from rosbridge_eth.errors import BridgeError
 from rosbridge_eth.inbox import Inbox
@@ -71,7 +72,7 @@ class AnvilNode:
 
     def __init__(self, dice: random.Random) -> None:
         pace = dice.choice([0.5, 1.0])
-        self._anvil = Anvil.start(geth_network.free_ports(1)[0], block_time=pace, options=["--silent"])
+        self._anvil = Anvil.start(free_port(), block_time=pace, options=["--silent"])
         self.url, self.ask, self._dice = self._anvil.url, self._anvil.ask, dice
         for number in range(ROBOTS + 1):
             self.ask("anvil_setBalance", KEYS.account(number).address, hex(1000 * ETH if number == 0 else 0))

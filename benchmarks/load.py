@@ -50,7 +50,7 @@ from pathlib import Path
 from typing import Any
 
 import geth_network
-
+from ports import free_port
 from rosbridge_eth import server as door
 from rosbridge_eth.administration import deploy_contract, init_home, load_server_identity, register_robot
 from rosbridge_eth.bundle import Request, read_bundle
@@ -72,7 +72,7 @@ from rosbridge_eth.identity import (
     public_identity,
 )
 from rosbridge_eth.ledger import Keyring, Ledger
-from rosbridge_eth.ledger.contract import Receipt, call_gas
+from rosbridge_eth.ledger.contract import Place, Receipt, call_gas
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
 from rosbridge_eth.reading import Verifier
 from rosbridge_eth.registry import Registry
@@ -140,22 +140,24 @@ class Figures:
 class Unwaited(Ledger):
     """The operator's transactions one behind the other, without waiting for the block of each; then `settle`."""
 
+    def __init__(self, where: Any, place: Place, account: str) -> None:
+        super().__init__(where, place.contract, place)
+        [(self._next, _)] = self.nonces([account])
+        self._fees, self._hashes = self.fees(self.block()), list[bytes]()
+
     def transact(self, account: Any, function: str, *arguments: Any, value: int = 0, wait: float = 120.0) -> Receipt:
-        if not hasattr(self, "_next"):
-            self._next, self._sent = self.nonces([account.address])[0][0], list[bytes]()
-            self._at = self.fees(self.block())
         data = self.calldata(function, *arguments)
-        signed = self.sign(account, data, nonce=self._next, gas=call_gas(data), fees=self._at, value=value)
+        signed = self.sign(account, data, nonce=self._next, gas=call_gas(data), fees=self._fees, value=value)
         [refused] = self.send([signed.raw])
         if refused is not None:
             raise refused
         self._next += 1
-        self._sent.append(signed.hash)
+        self._hashes.append(signed.hash)
         return Receipt(signed.hash, 0, True, 0, None)
 
     def settle(self) -> None:
         """Until blocks hold all of them."""
-        for hash in getattr(self, "_sent", []):
+        for hash in self._hashes:
             deadline = time.monotonic() + SETTLING
             while (receipt := self.receipt(hash)) is None:
                 if time.monotonic() > deadline:
@@ -185,7 +187,7 @@ class Operator:
         where: Any = "http://127.0.0.1:8545"
         if chain == "anvil":
             # Blocks come when there is something to write: the node is not what is measured.
-            self.anvil = self._stack.enter_context(Anvil.start(_free_port()))
+            self.anvil = self._stack.enter_context(Anvil.start(free_port()))
             where = self.anvil.url
         elif chain == "clique":
             keys = Keyring.create()
@@ -216,7 +218,7 @@ class Operator:
         self.trust = Trust(roots)
         on_stage(f"{robots} robots: keys, certificates, accounts, registrations in the contract")
         ca = load_ca(self.home.ca, self.passphrase, now)
-        registrar = Unwaited(where, self.deployment.contract, self.deployment) if keys is not None else self.ledger
+        registrar = Unwaited(where, self.deployment, keys.operator.address) if keys is not None else self.ledger
         self.robots = [self._register(registrar, ca, f"robot_{number}", now) for number in range(1, robots + 1)]
         if isinstance(registrar, Unwaited):
             registrar.settle()
@@ -229,7 +231,7 @@ class Operator:
     def _open_store(self, folder: Path, store: str) -> str:
         if store != "redis":
             return store
-        port = _free_port()
+        port = free_port()
         (folder / "redis").mkdir()
         process = subprocess.Popen(
             ["redis-server", "--port", str(port), "--bind", "127.0.0.1", "--dir", str(folder / "redis"), *DURABLE],
@@ -346,13 +348,6 @@ def _time_calls(owner: Any, name: str) -> dict[str, float]:
     return total
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 def _status_kib(name: str) -> int:
     """A line of /proc/self/status; 0 where there is none."""
     try:
@@ -419,7 +414,6 @@ class Session:
             operator.spools / f"{robot.name}.sqlite", place, max_bytes=64 * MIB, drop=partial(drop, place, key)
         )
         self._chunks: list[Chunk] = []
-        self._sending = False
 
     def seal(self, messages: int, per_chunk: int) -> dict[bytes, bytes]:
         writer = LogWriter(

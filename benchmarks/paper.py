@@ -32,6 +32,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,6 @@ import geth_network
 import load
 import paper_page
 import scale
-
-from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.supervisor import open_store, open_submitter
@@ -108,8 +107,8 @@ def user_end(quick: bool) -> Part:
 
 def spread(calls: Sequence[float], messages: int) -> list[float]:
     """What each message took of calls that several messages share."""
-    return [calls[min(n * len(calls) // messages, len(calls) - 1)] * len(calls) / messages for n in range(messages)] \
-        if len(calls) < messages else list(calls[:messages])  # fmt: skip
+    share = min(1.0, len(calls) / messages)
+    return [calls[int(n * share)] * share for n in range(messages)]
 
 
 def server_end(quick: bool) -> Part:
@@ -151,10 +150,11 @@ def interaction(kind: str, quick: bool, dag: Path | None) -> Part:
 def bridge(kind: str, quick: bool, dag: Path | None) -> Part:
     """Four robots from `init` to a proven read; by proof of work with a reorganisation in a second run."""
     messages = 10 if quick else 400
-    with _network(dag, 3, 1) as (urls, keys), tempfile.TemporaryDirectory() as folder:
+    network = chain_interaction.network("clique" if dag is None else "ethash", 0, 1, dag)
+    with network as urls, tempfile.TemporaryDirectory() as folder:
         began = time.monotonic()
         operator = load.Operator(
-            Path(folder), urls[0], "sqlite", 4, say, keys=keys, confirmations=CONFIRMATIONS[kind]
+            Path(folder), urls[0], "sqlite", 4, say, keys=chain_interaction.KEYS, confirmations=CONFIRMATIONS[kind]
         )
         ready = time.monotonic() - began
         try:
@@ -165,24 +165,13 @@ def bridge(kind: str, quick: bool, dag: Path | None) -> Part:
     return part if dag is None else part | {"reorganisation": reorganisation(dag)}
 
 
-@contextmanager
-def _network(dag: Path | None, nodes: int, miners: int) -> Iterator[tuple[list[str], Keyring]]:
-    """A network where a new operator has 100 ETH, and its nodes' URLs."""
-    keys = Keyring.create()
-    with tempfile.TemporaryDirectory(prefix="network-") as folder, geth_network.Network(
-        Path(folder), geth_network.ten_accounts(keys.operator.address), nodes=nodes, miners=miners, dag=dag
-    ) as network:  # fmt: skip
-        network.await_blocks(2)
-        yield [node.url for node in network.nodes], keys
-
-
 def reorganisation(dag: Path) -> Part:
     """Two miners are cut from each other, and the one that the submitter writes to loses.
 
     It is stopped DEPTH blocks after it was cut off; the other goes on with two threads until it is further. What was
     written in the lost blocks has to be on the chain once again afterwards, once, and everything in order.
     """
-    keys = Keyring.create()
+    keys = chain_interaction.KEYS
     with tempfile.TemporaryDirectory() as folder, geth_network.Network(
         Path(folder) / "network", geth_network.ten_accounts(keys.operator.address), nodes=2, miners=2, dag=dag
     ) as network:  # fmt: skip
@@ -204,15 +193,18 @@ def reorganisation(dag: Path) -> Part:
         def written() -> int:
             return operator.ledger.standings([tk])[0].chunks
 
+        def stands(chunks: int) -> bool:
+            return written() == chunks
+
         inbox.append([(tk, chunk) for chunk in chunks[:5]], time.time())
-        turn_until(submitter, lambda: written() == 5)
+        turn_until(submitter, partial(stands, 5))
         say("the miners are cut from each other")
         network.cut_off(ours)
         fork = ours.height()
         other.request("miner_start", 2)
         for given in (10, 15):  # two batches, in blocks that will be lost
             inbox.append([(tk, chunk) for chunk in chunks[given - 5 : given]], time.time())
-            turn_until(submitter, lambda given=given: written() == given)  # type: ignore[misc]
+            turn_until(submitter, partial(stands, given))
         turn_until(submitter, lambda: ours.height() >= fork + DEPTH)
         ours.request("miner_stop")
         before, depth = written(), ours.height() - fork
@@ -227,7 +219,7 @@ def reorganisation(dag: Path) -> Part:
         say(f"the chain turned: {after} chunks are left")
         inbox.append([(tk, chunk) for chunk in chunks[15:]], time.time())
         ours.request("miner_start", 1)
-        turn_until(submitter, lambda: written() == len(chunks))
+        turn_until(submitter, partial(stands, len(chunks)))
         found = load.read_back(operator, operator.ledger, robot)
         back = [chunk for batch in found.batches for chunk in batch]
         figures = Part(

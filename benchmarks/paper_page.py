@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+
 import scale
 
 matplotlib.use("Agg")

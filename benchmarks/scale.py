@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import bridge_costs
-import load
 import numpy
 
+import bridge_costs
+import load
 from rosbridge_eth.ledger.contract import set_data_gas
 
 RATES = (1, 10, 100)  # messages a second of each robot
@@ -129,8 +129,9 @@ def measure(quick: bool) -> dict[str, Any]:
             operator.close()
     first = runs[0]
     chunk_ms = first.submitter_cpu_ms * messages * first.sessions / first.chunks
-    costs = Costs(**asdict(costs) | {"handshake_ms": first.handshake_cpu_ms, "submitted_ms": chunk_ms,
-                                     "session_kib": first.growth_kib_per_session})  # fmt: skip
+    costs = replace(
+        costs, handshake_ms=first.handshake_cpu_ms, submitted_ms=chunk_ms, session_kib=first.growth_kib_per_session
+    )
     compared = []
     for run in runs:
         worked = run.sessions * costs.handshake_ms + run.sent * costs.record_ms + run.chunks * costs.chunk_ms

@@ -177,7 +177,6 @@ class OperatorHome:
         self.reader_config = path / "reader.toml"
         self.inbox = path / "inbox.sqlite"
         self.bundles = path / "bundles"
-        self.submitter_lock = path / "submitter.lock"
 
     @property
     def ca(self) -> Path:

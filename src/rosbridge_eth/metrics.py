@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from rosbridge_eth.server import Worker
 
 SILENCE: Final = 15.0  # seconds without a beat after which a process counts as hanging
-BEAT_EVERY: Final = 1.0
 DEADLINE: Final = 10.0  # seconds for a client to send its request and take the answer
 LITTLE_ROOM: Final = 64 << 20  # bytes; below this the disk counts as full
 

@@ -35,7 +35,6 @@ SIMULATED = 60 * 10**9  # ns of a simulation without an end that are looked at
 SETTLED = 1.0  # seconds in which a live graph offers nothing new
 PATIENCE = 5.0  # seconds for it to offer anything
 ENOUGH = 2**24  # bytes of captured lines, after which no more is read
-GAS_A_BYTE = 40  # of calldata (EIP-7623), see ledger.contract.set_data_gas
 
 
 def robot_toml(topics: Sequence[str], source: str) -> str:
@@ -93,7 +92,7 @@ class Heard:
 
 def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, Any]:
     """Listen for so many seconds at most; what `topics --json` prints. Raises SourceError, ConfigError."""
-    from rosbridge_eth.ledger.contract import set_data_gas
+    from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_gas
     from rosbridge_eth.ledger.submitter import BATCH_BYTES
 
     source, stop, room = everything(config), threading.Event(), [ENOUGH]

@@ -13,7 +13,6 @@ import os
 import re
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -24,12 +23,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 _FENCE = re.compile(r"^```(\w+)(?: +([^\n]*))?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 TYPED_IN = 200.0  # seconds, on a machine that is busy with other things
-
-
-def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def script_of(page: str, marked: str = "") -> tuple[str, list[str]]:

@@ -12,12 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from bridge.load_script import load_script
+import load
 from rosbridge_eth import supervisor
 from rosbridge_eth.channel import ServerConfig
 
 SESSIONS, MESSAGES, WORKERS = 24, 5, 2
-load = load_script("load")
 
 
 @pytest.mark.slow

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from bridge.pages import ROOT, free_port, type_page
+from bridge.pages import ROOT, type_page
 from bridge.sources.ros2.graph import free_domain, ros2_python
 from conftest import unavailable
+from ports import free_port
 from rosbridge_eth import administration as admin
 from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.config import load_robot_config, load_server_config

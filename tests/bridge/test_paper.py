@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from bridge.load_script import SCRIPTS, load_script
+import geth_network
+import scale
 from conftest import unavailable
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    geth = load_script("geth_network")
     try:
-        geth.find_geth()
-    except geth.Unavailable as reason:
+        geth_network.find_geth()
+    except geth_network.Unavailable as reason:
         unavailable(str(reason))
     folder = tmp_path_factory.mktemp("evaluation")
-    command = [sys.executable, str(SCRIPTS / "paper.py"), "--quick", "--out", str(folder)]
+    command = [sys.executable, str(Path(scale.__file__).with_name("paper.py")), "--quick", "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr[-2000:]
     return folder
@@ -48,7 +48,6 @@ def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> No
 
 
 def test_the_model_needs_more_of_everything_for_more_robots() -> None:
-    scale = load_script("scale")
     costs = scale.Costs(0.01, 0.5, 4.0, 1.0, 70.0, 700.0, 100.0)
     for rate in scale.RATES:
         needs = [scale.need(costs, robots, rate, 1.0) for robots in scale.ROBOTS]

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from bridge.load_script import load_script
+import faults
+import load
 from bridge.redis_server import RedisServer
+from ports import free_port
 
-load, faults = load_script("load"), load_script("faults")
 ROBOTS, MESSAGES = 6, 40
 LIMIT = 90.0  # s for a phase
 
@@ -35,7 +36,7 @@ class Site:
     """Operator, node and server; robots that have sealed all that they will say."""
 
     def __init__(self, folder: Path, redis: RedisServer) -> None:
-        port = faults.free_port(socket.SOCK_DGRAM)
+        port = free_port(socket.SOCK_DGRAM)
         self.operator = load.Operator(
             folder, "anvil", redis.url, ROBOTS, lambda stage: None, listen=f"127.0.0.1:{port}"
         )

@@ -14,7 +14,6 @@ from collections import deque
 from rosbridge_eth.channel.admission import TokenBucket
 from rosbridge_eth.channel.wire import DATAGRAM_SIZE
 
-PACKET_THRESHOLD = 3
 TIME_THRESHOLD = 9 / 8
 GRANULARITY = 0.001  # s
 INITIAL_RTT = 0.2  # s; RFC 9002 has 0.333, a handshake has usually measured it before

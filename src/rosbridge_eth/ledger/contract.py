@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 WEI_PER_ETH = 10**18
 BALANCE_LIMIT = 5 * WEI_PER_ETH  # allocETH does not go beyond it
+#: Of calldata: the floor of EIP-7623, and more than a byte takes in execution (16 calldata, 8 event, about 1 for
+#: hashing and memory).
+GAS_A_BYTE = 40
 NOTHING = bytes(32)  # the tail of a robot that wrote no chunk
 PAGE = 500  # robots in one `standings`
 SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
@@ -129,16 +132,14 @@ class Receipt(NamedTuple):
 def set_data_gas(chunks: Sequence[int]) -> int:
     """A gas limit for setData with chunks of these many bytes: never too low, above what is used by a tenth or so.
 
-    Linear, so that no node has to estimate it. 40 a byte of calldata is the floor of EIP-7623 and more than the byte
-    takes in execution (16 calldata, 8 event, about 1 for hashing and memory); tests/bridge/ledger holds it against
-    the EVM.
+    Linear, so that no node has to estimate it; tests/bridge/ledger holds it against the EVM.
     """
-    return 110_000 + sum(40 * (-size // 32 * -32) + 1_500 for size in chunks)
+    return 110_000 + sum(GAS_A_BYTE * (-size // 32 * -32) + 1_500 for size in chunks)
 
 
 def call_gas(data: bytes) -> int:
     """A gas limit for any other call of the contract."""
-    return 250_000 + 40 * len(data)
+    return 250_000 + GAS_A_BYTE * len(data)
 
 
 @cache

@@ -14,10 +14,9 @@ from contextlib import ExitStack
 
 import pytest
 
-from bridge.load_script import load_script
+import faults
 from conftest import unavailable
 
-faults = load_script("faults")
 IN_SEVERAL = {"robot", "worker", "submitter", "network"}
 CHOSEN = [name for name in faults.FAULTS if os.environ.get("FAULTS") == "all" or name not in IN_SEVERAL]
 SEED = int(os.environ.get("FAULTS_SEED") or random.SystemRandom().randrange(1 << 31))

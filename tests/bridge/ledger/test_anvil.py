@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +13,10 @@ from pathlib import Path
 import pytest
 from eth_utils.crypto import keccak
 
+import ledger_faults
 from bridge.ledger.world import ETH, KEYS, World
-from bridge.load_script import load_script
 from conftest import unavailable
+from ports import free_port
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import Ledger, nodes
@@ -28,12 +28,6 @@ pytestmark = pytest.mark.service
 
 OPERATOR, ROBOT, TK = KEYS.operator, KEYS.robot(1), robot_id("robot_1")
 GWEI = 10**9
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def start(port: int, **options) -> Anvil:
@@ -240,9 +234,8 @@ def test_a_missing_program_is_said(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize(("chain", "seed"), [("anvil", 0), ("anvil", 1), ("clique", 0)])
 def test_every_chunk_is_written_once_whatever_happens(chain: str, seed: int, node: Anvil):
     """benchmarks/ledger_faults.py, of which many more seeds were run by hand (docs/ledger.md)."""
-    faults = load_script("ledger_faults")
     try:
-        result = faults.run(chain, seed, 6.0)
-    except faults.geth_network.Unavailable as reason:
+        result = ledger_faults.run(chain, seed, 6.0)
+    except ledger_faults.geth_network.Unavailable as reason:
         unavailable(str(reason))
-    assert faults.is_right(result), json.dumps(result, indent=1)
+    assert ledger_faults.is_right(result), json.dumps(result, indent=1)

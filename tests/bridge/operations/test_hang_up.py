@@ -2,77 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pty
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 import rosbridge_eth
+from bridge.lone_robot import CA, NOW, READER, chunks_of, command, lines_of, lone_robot
 from bridge.sources.ros1.graph import Graph, eventually
 from rosbridge_eth import identity as ids
-from rosbridge_eth.bundle import Bundle, ask_to_join, join
-from rosbridge_eth.chunk import Chunk, Log, NoGrant, content_key, drop, open_lines, robot_id
-from rosbridge_eth.home import BridgeEnd, RobotHome
-from rosbridge_eth.spool import Spool
-from smcrypto import sm2
+from rosbridge_eth.home import RobotHome
 
-PASSWORD = b"robot's"
-END = BridgeEnd("robot_1", "server", "127.0.0.1:9", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
-LOG = Log(END.ledger, robot_id(END.robot))
-NOW = datetime.now(UTC)
-CA = ids.create_ca("CA", at=NOW)
-OWNER, LATE = (ids.enrol(CA, ids.Role.READER, name, at=NOW) for name in ("owner", "late"))
+LATE = ids.enrol(CA, ids.Role.READER, "late", at=NOW)
 
 
 @pytest.fixture
 def robot(tmp_path: Path) -> RobotHome:
-    """The home of a registered robot, whose server is not there."""
-    home = RobotHome(tmp_path / "robot")
-    request = ask_to_join(home, END.robot, PASSWORD)
-    peer = ids.enrol_requests(CA, ids.Role.ROBOT, END.robot, request.signing, request.encryption, at=NOW)
-    certificates = {name: text.decode() for name, text in ids.certificate_files(peer, [CA.certificate]).items()}
-    join(home, Bundle(END, certificates, {"owner": OWNER.public.pem.decode()}))
-    (tmp_path / "word").write_bytes(PASSWORD)
-    return home
-
-
-def command(home: RobotHome, *more: str) -> list[str]:
-    arguments = ["--home", str(home.path), "--password-file", str(home.path.parent / "word"), *more]
-    return [sys.executable, "-m", "rosbridge_eth", "robot", *arguments]
+    return lone_robot(tmp_path)
 
 
 def environment(**more: str) -> dict[str, str]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("ROS")}
     return kept | {"PYTHONPATH": str(Path(rosbridge_eth.__file__).parents[1])} | more
-
-
-def chunks_of(home: RobotHome) -> Iterator[Chunk]:
-    """What stands in its spool."""
-    spool = Spool(home.spool, LOG, max_bytes=1 << 30, drop=partial(drop, LOG, OWNER.signing_key))
-    place = spool.first_unconfirmed()
-    while place is not None:
-        yield from spool.following(place[0], None, 1 << 30)
-        place = spool.next_stream(place[0])
-    spool.close()
-
-
-def lines_of(chunks: list[Chunk], key: sm2.PrivateKey) -> list[dict[str, object]]:
-    """The lines that the key opens."""
-    found: list[dict[str, object]] = []
-    for chunk in chunks:
-        try:
-            found += map(json.loads, open_lines(LOG, chunk, content_key(chunk.header, key)) if chunk.body else ())
-        except NoGrant:
-            continue
-    return found
 
 
 @pytest.mark.service
@@ -85,7 +41,7 @@ def test_topics_and_readers_are_taken_up_and_no_message_is_lost(
     robot.config.write_text(f'topics = ["/kept", "/left"]\n{source}')
     log = tmp_path / "log"
     with log.open("wb") as stream:
-        process = subprocess.Popen(command(robot), env=environment(), stderr=stream)
+        process = subprocess.Popen([sys.executable, *command(robot)], env=environment(), stderr=stream)
 
     def said(words: str) -> bool:
         return words in log.read_text()
@@ -115,14 +71,14 @@ def test_topics_and_readers_are_taken_up_and_no_message_is_lost(
         process.kill()
         graph.close()
     chunks = [*chunks_of(robot)]
-    owners, lates = (lines_of(chunks, reader.encryption_key) for reader in (OWNER, LATE))
-    numbers = {line["data"]["data"] for line in owners + lates if line.get("topic") == "/kept"}  # type: ignore[index]
+    owners, lates = (lines_of(chunks, reader.encryption_key) for reader in (READER, LATE))
+    numbers = {line["data"]["data"] for line in owners + lates if line.get("topic") == "/kept"}
     assert numbers == {*range(max(numbers) + 1)}, "every message from the first to the last"
     assert {line.get("topic") for line in lines_of(chunks[-1:], LATE.encryption_key)} <= {"/kept", "/new", None}
     assert sum(line.get("topic") == "/new" for line in lates) == 50
     first = next(line for line in lates if "stream" not in line)
     assert "definition" in first, "it stands before the first message"
-    assert len(lines_of(chunks[-1:], OWNER.encryption_key)) == 0 < len(lines_of(chunks, OWNER.encryption_key))
+    assert len(lines_of(chunks[-1:])) == 0 < len(lines_of(chunks))
     assert len({chunk.header.stream for chunk in chunks}) == 1
 
 
@@ -130,7 +86,7 @@ def test_a_robot_whose_terminal_is_gone_ends_in_good_order(robot: RobotHome):
     robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
     pid, terminal = pty.fork()
     if pid == 0:
-        arguments = command(robot)
+        arguments = [sys.executable, *command(robot)]
         os.execve(arguments[0], arguments, environment(TERM="dumb"))
     said = b""
     while b"Ctrl-C ends it" not in said:

@@ -20,6 +20,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from bridge.secrecy import betrayed, leaves
+from ports import free_port
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.ledger.nodes import Anvil
@@ -29,12 +30,6 @@ ROOT = Path(__file__).resolve().parents[3]
 PASSPHRASE, PASSWORD, READERS = "operators-words-4711", "robots-words-0815", "readers-words-2342"
 PATIENCE = 60.0
 pytestmark = [pytest.mark.service, pytest.mark.slow]
-
-
-def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def ask(port: int, path: str) -> tuple[int, bytes]:
@@ -123,8 +118,8 @@ class Bridge:
 def _bridge(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]) -> Iterator[Bridge]:
     require("npx")
     path, node, udp, monitor = (
-        tmp_path_factory.mktemp("processes"), free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM),
-        free_port(socket.SOCK_STREAM),
+        tmp_path_factory.mktemp("processes"), free_port(), free_port(socket.SOCK_DGRAM),
+        free_port(),
     )
     made = Bridge(path, node, monitor, Anvil.start(node, state=path / "chain.json"))
     made.environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
@@ -187,7 +182,7 @@ def test_logs_at_their_most_talkative_name_every_chunk_and_betray_nothing(bridge
 
 
 def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: Bridge):
-    port = free_port(socket.SOCK_STREAM)
+    port = free_port()
     robot = bridge.start_robot('kind = "sim"', f'monitor = "127.0.0.1:{port}"\n')
     try:
         bridge.until("ready", lambda: ask(port, "/readyz")[0] == 200)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -13,6 +12,7 @@ import xmlrpc.client
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from ports import free_port
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule
 from rosbridge_eth.sources import Selection
 from rosbridge_eth.sources.ros1 import Ros1Source
@@ -21,12 +21,6 @@ from rosbridge_eth.sources.ros1.publisher import Cause
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
 PUBLISHERS = Path(__file__).with_name("publishers.py")
 PATIENCE = 20.0
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def eventually(condition: Callable[[], object], what: str, patience: float = PATIENCE) -> None:

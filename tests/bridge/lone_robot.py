@@ -1,0 +1,61 @@
+"""The home of a registered robot whose server is not there, and what stands in its spool."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rosbridge_eth import identity as ids
+from rosbridge_eth.bundle import Bundle, ask_to_join, join
+from rosbridge_eth.chunk import Chunk, Log, NoGrant, content_key, drop, open_lines, robot_id
+from rosbridge_eth.home import BridgeEnd, RobotHome
+from rosbridge_eth.spool import Spool
+from smcrypto import sm2
+
+END = BridgeEnd("robot_1", "server", "127.0.0.1:9", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+LOG = Log(END.ledger, robot_id(END.robot))
+NOW = datetime.now(UTC)
+CA = ids.create_ca("CA", at=NOW)
+READER = ids.enrol(CA, ids.Role.READER, "owner", at=NOW)
+
+
+def lone_robot(folder: Path) -> RobotHome:
+    """A home in `folder`, sealing for READER; its password is in `folder`/word."""
+    home, password = RobotHome(folder / "robot"), b"robot's"
+    request = ask_to_join(home, END.robot, password)
+    peer = ids.enrol_requests(CA, ids.Role.ROBOT, END.robot, request.signing, request.encryption, at=NOW)
+    certificates = {name: text.decode() for name, text in ids.certificate_files(peer, [CA.certificate]).items()}
+    join(home, Bundle(END, certificates, {"owner": READER.public.pem.decode()}))
+    (folder / "word").write_bytes(password)
+    return home
+
+
+def command(home: RobotHome, *more: str) -> list[str]:
+    """What Python is given to run this robot."""
+    arguments = ["--home", str(home.path), "--password-file", str(home.path.parent / "word"), *more]
+    return ["-m", "rosbridge_eth", "robot", *arguments]
+
+
+def chunks_of(home: RobotHome) -> Iterator[Chunk]:
+    """What stands in its spool, the oldest first."""
+    spool = Spool(home.spool, LOG, max_bytes=1 << 30, drop=partial(drop, LOG, READER.signing_key))
+    place = spool.first_unconfirmed()
+    while place is not None:
+        yield from spool.following(place[0], None, 1 << 30)
+        place = spool.next_stream(place[0])
+    spool.close()
+
+
+def lines_of(chunks: Iterable[Chunk], key: sm2.PrivateKey = READER.encryption_key) -> list[dict[str, Any]]:
+    """The lines that the key opens."""
+    found: list[dict[str, Any]] = []
+    for chunk in chunks:
+        try:
+            found += map(json.loads, open_lines(LOG, chunk, content_key(chunk.header, key)) if chunk.body else ())
+        except NoGrant:
+            continue
+    return found
