@@ -506,7 +506,7 @@ class Flow:
         count.sealed, count.on_chain = len(sealed), len(sealed & written.keys())
         count.acknowledged = len(sealed) - len(named)
         count.doubled = sum(times - 1 for times in written.values())
-        dropped = sum(chunk.dropped for chunk in log.chunks)
+        dropped = sum(chunk.bare for chunk in log.chunks)
         count.declared = dropped + len((sealed - written.keys()) & (waiting | dead))
         count.missing = len(sealed - written.keys() - waiting - dead) + count.missing
         count.records = len(log.records)

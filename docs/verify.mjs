@@ -1,12 +1,13 @@
 // Reads a robot's log from a chain and proves it, independently of rosbridge_eth: written from docs/log.md alone,
 // on ethers (the chain), sm-crypto-v2 (SM2, SM3, SM4) and fzstd (Zstandard).
 //
-//   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX]
+//   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX] [--archive FOLDER]
 //
 // --key is the reader's private encryption key, 32 bytes in hex; without it everything but the content is checked.
+// --archive is a folder with the bodies of archived chunks, or a copy of it; without it they are not looked at.
 // Proven records go to stdout as JSON lines, the verdict as one JSON object to stderr. Exit code 0: sound; 9: not.
 
-import { readFileSync } from 'node:fs'
+import { existsSync, readFileSync } from 'node:fs'
 import { parseArgs } from 'node:util'
 import { Contract, JsonRpcProvider, id as keccakOfText, getBytes, keccak256 } from 'ethers'
 import { decompress } from 'fzstd'
@@ -21,7 +22,7 @@ const ABI = [
   'event Revoked(bytes32 indexed Tk, address indexed account, uint256 index, uint256 previousBlock)',
 ]
 const SPAN = 2000 // blocks asked for at once
-const MAX = { body: 65536, readers: 16, records: 1000, plaintext: 4 << 20 }
+const MAX = { body: 65536, archived: 1 << 24, readers: 16, records: 1000, plaintext: 4 << 20 }
 const FIXED = 1 + 1 + 16 + 8 + 32 + 8 + 4 + 32 + 4 + 32 + 1
 const GRANT = 8 + 113
 const ZEROS = '00'.repeat(32)
@@ -117,7 +118,7 @@ function parse(data) {
   const take = (size) => data.slice(at, (at += size))
   const [version, flags] = take(2)
   const header = {
-    goodbye: flags === 1, stream: take(16), number: number(take(8)), previous: hex(take(32)),
+    goodbye: Boolean(flags & 1), archived: Boolean(flags & 2), stream: take(16), number: number(take(8)), previous: hex(take(32)),
     sealed: Number(number(take(8))), records: Number(number(take(4))), root: hex(take(32)),
     bodyLength: Number(number(take(4))), bodyDigest: hex(take(32)), grants: [],
   }
@@ -128,13 +129,13 @@ function parse(data) {
   const signature = take(64)
   const body = data.slice(at)
   const empty = header.records === 0
-  const formed = version === 2 && flags <= 1 && signature.length === 64 && header.sealed < 253402300800000 &&
+  const formed = version === 2 && flags <= 3 && signature.length === 64 && header.sealed < 253402300800000 &&
     (body.length === 0 || body.length === header.bodyLength) && (empty
-    ? header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
+    ? !header.archived && header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
     : header.records <= MAX.records && count >= 1 && count <= MAX.readers && header.bodyLength > 16 &&
-      header.bodyLength <= MAX.body && (header.bodyLength - 16) % 64 === 0)
+      header.bodyLength <= (header.archived ? MAX.archived : MAX.body) && (header.bodyLength - 16) % 64 === 0)
   if (!formed) throw new Wrong('malformed')
-  return { header, signature, body, dropped: header.bodyLength > 0 && body.length === 0 }
+  return { header, signature, body, bare: header.bodyLength > 0 && body.length === 0 }
 }
 
 function root(leaves) {
@@ -167,7 +168,7 @@ function open({ header, body }, log, readerKey) {
     const padding = plaintext.slice(end)
     if (padding.length >= 64 || padding.some((byte) => byte)) throw new Error('no padding')
     const content = Buffer.from(decompress(plaintext.slice(0, end)))
-    if (content.length > MAX.plaintext || content.at(-1) !== 10) throw new Error('no lines')
+    if (content.length > (header.archived ? MAX.archived : MAX.plaintext) || content.at(-1) !== 10) throw new Error('no lines')
     lines = []
     for (let at = 0, end; at < content.length; at = end + 1) lines.push(content.subarray(at, (end = content.indexOf(10, at))))
   } catch (error) {
@@ -197,7 +198,7 @@ function frameEnd(data) {
 // --- the reading
 
 const { values: options } = parseArgs({
-  options: Object.fromEntries(['node', 'contract', 'robot', 'ca', 'key'].map((name) => [name, { type: 'string' }])),
+  options: Object.fromEntries(['node', 'contract', 'robot', 'ca', 'key', 'archive'].map((name) => [name, { type: 'string' }])),
 })
 const provider = new JsonRpcProvider(options.node, undefined, { staticNetwork: true })
 const contract = new Contract(options.contract, ABI, provider)
@@ -212,7 +213,7 @@ const end = Number(standing.chunks)
 
 const findings = []
 const told = (kind, chunk, detail = '', count = 1) => findings.push({ kind, chunk, count, detail })
-const NOTICES = new Set(['dropped', 'lost', 'restarted', 'no-grant', 'clock'])
+const NOTICES = new Set(['dropped', 'lost', 'restarted', 'no-grant', 'archived', 'clock'])
 const times = new Map()
 const timeOf = async (n) => {
   if (!times.has(n)) times.set(n, (await provider.getBlock(n)).timestamp)
@@ -278,14 +279,20 @@ async function prove(data, at, event) {
   const { header } = chunk
   const governing = signers.findLast((one) => one.index <= at)
   if (!governing?.key) throw new Wrong('untrusted', governing?.why ?? (governing ? 'revoked' : 'not registered'))
-  const purpose = chunk.dropped ? 'dropped' : 'chunk'
-  const message = join(text.encode(`rosbridge-eth/2 ${purpose}\0`), log, header.encoded)
-  if (!holds(governing.key, message, chunk.signature, false)) throw new Wrong('forged')
+  const purposes = !chunk.bare ? ['chunk'] : header.archived ? ['chunk', 'dropped'] : ['dropped']
+  const purpose = purposes.find((one) =>
+    holds(governing.key, join(text.encode(`rosbridge-eth/2 ${one}\0`), log, header.encoded), chunk.signature, false))
+  if (!purpose) throw new Wrong('forged')
   if (header.sealed > governing.until) throw new Wrong('untrusted', "sealed after the certificate's end")
   follow(header, at)
   if (header.sealed > (await timeOf(event.blockNumber)) * 1000 + 300000) told('clock', at, 'sealed later than its block')
-  if (chunk.dropped) return told('dropped', at, '', header.records)
-  if (hex(digest(chunk.body)) !== header.bodyDigest) throw new Wrong('altered')
+  if (purpose === 'dropped') return told('dropped', at, '', header.records)
+  if (chunk.bare) {
+    if (!options.archive) return told('archived', at, '', header.records)
+    const file = `${options.archive}/${header.bodyDigest.slice(0, 2)}/${header.bodyDigest}`
+    if (existsSync(file)) chunk.body = new Uint8Array(readFileSync(file))
+    if (chunk.body.length !== header.bodyLength || hex(digest(chunk.body)) !== header.bodyDigest) throw new Wrong('withheld')
+  } else if (hex(digest(chunk.body)) !== header.bodyDigest) throw new Wrong('altered')
   if (!options.key) return header.records && told('no-grant', at, '', header.records)
   for (const [n, line] of open(chunk, log, options.key).entries()) {
     const shown = line.toString('utf8')

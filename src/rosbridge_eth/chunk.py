@@ -9,7 +9,8 @@
 
 Numbers are big-endian, hashes SM3, signatures SM2. The signature is over ledger | Tk | header for the
 purpose "chunk", or "dropped" where the robot itself removed the body; see identity. The root is the Merkle
-tree of RFC 9162, 2.1, over salted lines. docs/log.md says all of it byte by byte.
+tree of RFC 9162, 2.1, over salted lines. An archived chunk may be larger; its body rests in an archive under
+its digest, and header | signature go on the chain. docs/log.md says all of it byte by byte.
 
 Not here: what a line says (capture), when a chunk is closed (writer), which certificate governs (reading).
 """
@@ -21,7 +22,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from eth_utils.crypto import keccak
@@ -36,16 +37,20 @@ else:
     from compression import zstd
 
 VERSION: Final = 2
-#: The only flag: the last chunk of an orderly run.
+#: Flags: the last chunk of an orderly run; the body is in the archive and not on the chain.
 GOODBYE: Final = 1
+ARCHIVED: Final = 2
 
 MAX_BODY: Final = 64 * 1024 - 48  # the longest below 64 KiB: 1,023 blocks of 64 and the tag
+MAX_ARCHIVED_BODY: Final = 16 * 1024 * 1024 - 48
 MAX_READERS: Final = 16
 MAX_RECORDS: Final = 1000
 #: Bytes of JSON Lines that a reader unpacks at most.
 MAX_PLAINTEXT: Final = 4 * 1024 * 1024
+MAX_ARCHIVED_PLAINTEXT: Final = 16 * 1024 * 1024
 #: Bytes of a line that fits a chunk of its own whatever it holds.
 MAX_LINE: Final = 60 * 1024
+MAX_ARCHIVED_LINE: Final = MAX_ARCHIVED_PLAINTEXT - 128 * 1024  # zstd makes 1/256 more of what it cannot compress
 #: The year 10000; a chunk is sealed before.
 MAX_TIME_MS: Final = 253_402_300_800_000
 
@@ -57,11 +62,14 @@ _GRANT = _TAG + _WRAPPED
 _FIXED = struct.Struct(">BB16sQ32sQI32sI32sB")
 MAX_HEADER: Final = _FIXED.size + MAX_READERS * _GRANT
 MAX_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_BODY
+MAX_ARCHIVED_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_ARCHIVED_BODY
 
 #: zstd's level, chosen by benchmarks/bench_log.py.
 LEVEL: Final = 9
+#: Of archived chunks: it undoes what base64 adds, at ten times the speed of level 9 (benchmarks/video.py).
+ARCHIVED_LEVEL: Final = 1
 _MAGIC = b"\x28\xb5\x2f\xfd"
-_WINDOW = {int(zstd.DecompressionParameter.window_log_max): 22}  # 4 MiB
+_MAX_BLOCK = 128 * 1024  # RFC 8878, 3.1.1.2.4
 
 Randomness = Callable[[int], bytes]
 
@@ -135,6 +143,11 @@ class Header:
         """Whether the robot said that nothing follows in this stream."""
         return bool(self.flags & GOODBYE)
 
+    @property
+    def archived(self) -> bool:
+        """Whether the body's place is the archive."""
+        return bool(self.flags & ARCHIVED)
+
     def __str__(self) -> str:
         return f"chunk {self.number} of stream {self.stream.hex()[:8]}"
 
@@ -144,7 +157,7 @@ class Header:
         if not _FIXED.size <= len(data) <= MAX_HEADER:
             raise Malformed(f"no header of a chunk has {len(data)} bytes")
         version, flags, stream, number, previous, sealed, records, root, size, digest, count = _FIXED.unpack_from(data)
-        if version != VERSION or flags & ~GOODBYE:
+        if version != VERSION or flags & ~(GOODBYE | ARCHIVED):
             raise Malformed(f"a chunk of version {version} with flags {flags} is not known here")
         if len(data) != _FIXED.size + count * _GRANT:
             raise Malformed(f"a header with {count} grants does not have {len(data)} bytes")
@@ -156,11 +169,11 @@ class Header:
         if sealed >= MAX_TIME_MS:
             raise Malformed(f"{header} was sealed after the year 9999")
         if records == 0:
-            if size or grants or root != _EMPTY or digest != _EMPTY:
-                raise Malformed(f"{header} has no records, and a body, root or grants nevertheless")
+            if size or grants or root != _EMPTY or digest != _EMPTY or header.archived:
+                raise Malformed(f"{header} has no records, and a body, root, grants or an archive nevertheless")
         elif (
-            records > MAX_RECORDS or not 1 <= count <= MAX_READERS
-            or not _GCM_TAG < size <= MAX_BODY or size % _BLOCK != _GCM_TAG
+            records > MAX_RECORDS or not 1 <= count <= MAX_READERS or size % _BLOCK != _GCM_TAG
+            or not _GCM_TAG < size <= (MAX_ARCHIVED_BODY if header.archived else MAX_BODY)
         ):  # fmt: skip
             raise Malformed(f"{header} cannot have {records} records in {size} bytes for {count} readers")
         return header
@@ -172,7 +185,7 @@ _EMPTY = sm3.digest(b"")
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Header, signature and body; the dropped form has no body although the header names one."""
+    """Header, signature and body; a bare one has no body although its header names one."""
 
     header: Header
     signature: bytes = field(repr=False)
@@ -180,26 +193,32 @@ class Chunk:
 
     @property
     def encoded(self) -> bytes:
-        """The bytes that travel, rest and are written."""
+        """The bytes that travel from the robot's spool to the server."""
         return self.header.encoded + self.signature + self.body
 
     @property
-    def dropped(self) -> bool:
-        """Whether the body was removed."""
+    def bare(self) -> bool:
+        """Whether the body is not here: the robot dropped it, or it is in the archive; `signed_as` tells which."""
         return self.header.body_length > 0 and not self.body
+
+    @property
+    def on_chain(self) -> Chunk:
+        """The form that the chain has: an archived chunk without its body."""
+        return replace(self, body=b"") if self.header.archived else self
 
     @staticmethod
     def parse(data: bytes | memoryview) -> Chunk:
-        """The chunk whose encoding is exactly `data`, whole or dropped; Malformed if there is none.
+        """The chunk whose encoding is exactly `data`, whole or bare; Malformed if there is none.
 
         Nothing is verified: see `verify`.
         """
-        if not _FIXED.size <= len(data) <= MAX_CHUNK:
+        if not _FIXED.size <= len(data) <= MAX_ARCHIVED_CHUNK:
             raise Malformed(f"no chunk has {len(data)} bytes")
-        data = bytes(data)
-        end = _FIXED.size + data[_FIXED.size - 1] * _GRANT
-        header = Header.parse(data[:end])
-        signature, body = data[end : end + identity.SIGNATURE_SIZE], data[end + identity.SIGNATURE_SIZE :]
+        view = memoryview(data)  # so that the body is copied once
+        end = _FIXED.size + view[_FIXED.size - 1] * _GRANT
+        header = Header.parse(bytes(view[:end]))
+        signature, body = (bytes(part) for part in (view[end : end + identity.SIGNATURE_SIZE],
+                                                    view[end + identity.SIGNATURE_SIZE :]))  # fmt: skip
         if len(signature) != identity.SIGNATURE_SIZE or len(body) not in (0, header.body_length):
             raise Malformed(f"{header} does not have {len(data)} bytes")
         return Chunk(header, signature, body)
@@ -211,19 +230,20 @@ class Chunk:
 def seal(
     log: Log, key: sm2.PrivateKey, lines: Sequence[bytes], *,
     stream: bytes, number: int, previous: bytes, sealed_ms: int, readers: Sequence[sm2.PublicKey],
-    goodbye: bool = False, compress: bool = True, level: int = LEVEL, randomness: Randomness = secrets.token_bytes,
+    goodbye: bool = False, archived: bool = False, compress: bool = True, level: int | None = None,
+    randomness: Randomness = secrets.token_bytes,
 ) -> Chunk:
     """The chunk that holds `lines`, signed with the robot's `key` and encrypted to `readers` (1 to 16).
 
     lines: not empty and without newline, each; none at all make a chunk without body. previous: the digest of
     the header before. compress=False stores the lines as they are, so that sizes tell nothing of the content.
-    TooLarge if the lines do not fit; then nothing was used up.
+    archived: its body's place is the archive; it has lines. TooLarge if the lines do not fit; then nothing was used up.
     """
     root, body, grants = _EMPTY, b"", b""
     if lines:
         if not 1 <= len(readers) <= MAX_READERS:
             raise ValueError(f"a chunk is for 1 to {MAX_READERS} readers, not {len(readers)}")
-        plaintext = _pack(lines, compress, level)
+        plaintext = _pack(lines, compress, level or (ARCHIVED_LEVEL if archived else LEVEL), archived)
         place = stream + number.to_bytes(8, "big")
         secret = sm3.hmac(key.to_bytes(), b"rosbridge-eth/2 content key")
         fresh = randomness(32) + log.ledger + log.tk + place + sm3.digest(plaintext)
@@ -232,7 +252,7 @@ def seal(
         root = _levels(_leaves(lines, new_key))[-1][0]
         grants = b"".join(_tag(place, reader) + reader.encrypt(new_key, encoding="c1c3c2") for reader in readers)
     fixed = _FIXED.pack(
-        VERSION, GOODBYE if goodbye else 0, stream, number, previous, sealed_ms,
+        VERSION, GOODBYE * goodbye | ARCHIVED * archived, stream, number, previous, sealed_ms,
         len(lines), root, len(body), sm3.digest(body), len(grants) // _GRANT,
     )  # fmt: skip
     header = Header.parse(fixed + grants)
@@ -246,17 +266,19 @@ def drop(log: Log, key: sm2.PrivateKey, chunk: Chunk) -> Chunk:
     return Chunk(chunk.header, identity.sign(key, "dropped", _signed(log, chunk.header)), b"")
 
 
-def _pack(lines: Sequence[bytes], compress: bool, level: int) -> bytes:
+def _pack(lines: Sequence[bytes], compress: bool, level: int, archived: bool) -> bytes:
     """The plaintext: the lines in one frame, padded."""
     if any(not line or b"\n" in line for line in lines):
         raise ValueError("a line is not empty and holds no newline")
-    content = b"".join(line + b"\n" for line in lines)
-    if len(lines) > MAX_RECORDS or len(content) > MAX_PLAINTEXT:
-        raise TooLarge(f"{len(lines)} lines of {len(content)} bytes are too many for a chunk")
+    most = (MAX_ARCHIVED_BODY if archived else MAX_BODY) - _GCM_TAG
+    size = sum(map(len, lines)) + len(lines)
+    if len(lines) > MAX_RECORDS or size > (MAX_ARCHIVED_PLAINTEXT if archived else MAX_PLAINTEXT):
+        raise TooLarge(f"{len(lines)} lines of {size} bytes are too many for a chunk")
+    content = b"\n".join([*lines, b""])
     frame = _compressed(content, level) if compress else _stored(content)
-    if len(frame) > MAX_BODY - _GCM_TAG:
+    if len(frame) > most:
         raise TooLarge(f"{len(lines)} lines take {len(frame)} bytes, more than fit a chunk")
-    return frame + bytes(-len(frame) % _BLOCK)
+    return frame.ljust(len(frame) + -len(frame) % _BLOCK, b"\0")
 
 
 def _compressed(content: bytes, level: int) -> bytes:
@@ -267,9 +289,13 @@ def _compressed(content: bytes, level: int) -> bytes:
 
 
 def _stored(content: bytes) -> bytes:
-    """A frame of one raw block (RFC 8878, 3.1.1.1 and 3.1.1.2): single segment, content size in 4 bytes."""
-    size = min(len(content), MAX_BODY)  # one that is longer is refused for its length
-    return _MAGIC + b"\xa0" + size.to_bytes(4, "little") + (size << 3 | 1).to_bytes(3, "little") + content
+    """A frame of raw blocks (RFC 8878, 3.1.1.1 and 3.1.1.2): single segment, content size in 4 bytes."""
+    parts = [_MAGIC, b"\xa0", len(content).to_bytes(4, "little")]
+    for at in range(0, len(content), _MAX_BLOCK):
+        block = content[at : at + _MAX_BLOCK]
+        last = at + len(block) == len(content)
+        parts += (len(block) << 3 | last).to_bytes(3, "little"), block
+    return b"".join(parts)
 
 
 def _signed(log: Log, header: Header) -> bytes:
@@ -286,15 +312,26 @@ def _tag(place: bytes, reader: sm2.PublicKey) -> bytes:
 def verify(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> None:
     """Return if the holder of `public_key` signed `chunk` in this form and the body is its own; else Altered, Forged.
 
-    What is inside is not looked at: that needs the content key.
+    A bare chunk is the dropped form. What is inside is not looked at: that needs the content key.
     """
-    header, dropped = chunk.header, chunk.dropped
-    if not dropped and (len(chunk.body) != header.body_length or sm3.digest(chunk.body) != header.body_digest):
+    header = chunk.header
+    if not chunk.bare and (len(chunk.body) != header.body_length or sm3.digest(chunk.body) != header.body_digest):
         raise Altered(f"the body of {header} is not the one that its header names")
-    try:
-        identity.verify(public_key, "dropped" if dropped else "chunk", _signed(log, header), chunk.signature)
-    except InvalidSignature:
-        raise Forged(f"the signature of {header} does not hold") from None
+    if signed_as(log, public_key, chunk) == "chunk" and chunk.bare:
+        raise Altered(f"the body of {header}, which is for the archive, is not with it")
+
+
+def signed_as(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> str:
+    """The purpose for which the holder of `public_key` signed the chunk in this form; Forged if for none.
+
+    "dropped" where the robot removed the body, else "chunk". The body is not looked at.
+    """
+    may_be = ["chunk", "dropped"] if chunk.bare and chunk.header.archived else ["dropped" if chunk.bare else "chunk"]
+    for purpose in may_be:
+        with suppress(InvalidSignature):
+            identity.verify(public_key, purpose, _signed(log, chunk.header), chunk.signature)
+            return purpose
+    raise Forged(f"the signature of {chunk.header} does not hold")
 
 
 def content_key(header: Header, reader: sm2.PrivateKey) -> bytes:
@@ -312,11 +349,11 @@ def content_key(header: Header, reader: sm2.PrivateKey) -> bytes:
 def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:
     """The records of `chunk`; Unopenable unless tag, frame, padding, number of records and root are right.
 
-    The chunk is not dropped; its signature is `verify`'s matter.
+    The chunk is not bare; its signature is `verify`'s matter.
     """
     header = chunk.header
-    if chunk.dropped:
-        raise ValueError(f"{header} has no body any more")
+    if chunk.bare:
+        raise ValueError(f"the body of {header} is not here")
     if not chunk.body:
         return ()
     associated = log.ledger + log.tk + header.stream + header.number.to_bytes(8, "big")
@@ -334,13 +371,15 @@ def _unpack(header: Header, plaintext: bytes) -> tuple[bytes, ...]:
     """The lines of a plaintext; memory and time are bounded whatever it holds."""
     if not plaintext.startswith(_MAGIC):  # libzstd would take skippable frames and old formats as well
         raise Unopenable(f"{header} holds no zstd frame")
-    unpacking = zstd.ZstdDecompressor(options=_WINDOW)
+    most = MAX_ARCHIVED_PLAINTEXT if header.archived else MAX_PLAINTEXT
+    window = {int(zstd.DecompressionParameter.window_log_max): most.bit_length() - 1}
+    unpacking = zstd.ZstdDecompressor(options=window)
     try:
-        content = unpacking.decompress(plaintext, MAX_PLAINTEXT + 1)
+        content = unpacking.decompress(plaintext, most + 1)
     except zstd.ZstdError as error:
         raise Unopenable(f"{header} cannot be unpacked: {error}") from None
-    if not unpacking.eof or len(content) > MAX_PLAINTEXT:
-        raise Unopenable(f"{header} unpacks to more than {MAX_PLAINTEXT} bytes, or its frame has no end")
+    if not unpacking.eof or len(content) > most:
+        raise Unopenable(f"{header} unpacks to more than {most} bytes, or its frame has no end")
     padding = unpacking.unused_data
     if len(padding) >= _BLOCK or any(padding):
         raise Unopenable(f"{header} holds more than one frame and its padding")

@@ -26,6 +26,8 @@ from rosbridge_eth.errors import SourceError, VerificationError
 
 MAX_LINE: Final = 60 * 1024
 """Bytes of a line, so that any line fits into a chunk by itself, even if it does not compress."""
+MAX_ARCHIVED_LINE: Final = 16 * 1024 * 1024 - 128 * 1024
+"""The same of a chunk for the archive."""
 MAX_DEPTH: Final = 100
 """Levels of nesting of a line; definitions of messages are nested less (capture.definitions)."""
 
@@ -113,10 +115,10 @@ def stream_line(source_kind: str, software: str) -> bytes:
     return orjson.dumps({"stream": {"source": source_kind, "software": software}})
 
 
-def parse_line(line: bytes) -> Line:
+def parse_line(line: bytes, most: int = MAX_LINE) -> Line:
     """What a line says, or VerificationError: whoever signed it did not write it by these rules."""
-    if len(line) > MAX_LINE:
-        raise VerificationError(f"a record has {len(line)} bytes; at most {MAX_LINE} are allowed")
+    if len(line) > most:
+        raise VerificationError(f"a record has {len(line)} bytes; at most {most} are allowed")
     if _too_deep(line):
         raise VerificationError(f"a record is nested more than {MAX_DEPTH} deep")
     try:

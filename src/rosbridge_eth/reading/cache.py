@@ -203,7 +203,7 @@ def open_cache(folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust
     """What this reader has proven of the robot on this ledger under these CAs; None where nothing can be kept."""
     roots = sm3.digest(b"".join(root.to_der() for root in trust.roots))
     key = sm3.hmac(reader.to_bytes(), b"rosbridge-eth/2 what is proven" + log_.ledger + log_.tk + roots)[:16]
-    path = folder / f"{name}-{log_.ledger.hex()[:16]}.sqlite"
+    path = folder / f"{name}.sqlite"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         try:

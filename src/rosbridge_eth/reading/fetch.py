@@ -12,7 +12,7 @@ from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
 from rosbridge_eth.reading.cache import Cache, add_topics, open_cache
 from rosbridge_eth.reading.verdict import Bookmarks, Verdict, shown
-from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Choice, ProvenChunk, ProvenRecord, Verifier
+from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Bodies, Choice, ProvenChunk, ProvenRecord, Verifier
 from smcrypto import sm2
 
 if TYPE_CHECKING:
@@ -64,13 +64,14 @@ class Reading:
 def read_robot(
     ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
     bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
-    heartbeat: float = HEARTBEAT,
+    heartbeat: float = HEARTBEAT, bodies: Bodies | None = None,
 ) -> Reading:  # fmt: skip
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
     ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next
-    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted. Raises
-    ChainError; ConfigError for nodes of different ledgers; IdentityError for a name that the contract does not know.
+    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted.
+    bodies: of archived chunks, see Verifier. Raises ChainError; ConfigError for nodes of different ledgers; IdentityError for a name that
+    the contract does not know.
     """
     tk = robot_id(check_name(name))
     ledger, block, standing, told = _best(ledgers, tk, confirmations)
@@ -84,12 +85,15 @@ def read_robot(
     if mark is not None and confirmations > 1 and standing.chunks < mark.count <= ledger.standings([tk])[0].chunks:
         mark = replace(mark, count=0)  # it is above the block that is asked for, and not taken back
     registrations = ledger.registrations(tk, standing)
-    kept = None if cache is None or reader is None else _kept(cache, name, log, reader, trust, ledger, block, told)
+    kept = None if cache is None or reader is None else _kept(
+        cache, f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}", log, reader, trust, ledger,
+        block, told,
+    )  # fmt: skip
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
         block_time=ledger.block_time, now=now, mark=mark,
         at=None if kept is None else kept.progress, links=None if kept is None else kept.links, heartbeat=heartbeat,
-        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log),
+        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), bodies=bodies,
     )  # fmt: skip
     first_block = max(registrations[0].block if registrations else 0, kept.next_block if kept else 0)
     events = ledger.data_events(tk, first_block, standing.data_block)
@@ -119,7 +123,7 @@ def _keeping(kept: Cache, verifier: Verifier, events: Iterator[DataEvent], final
     """The chunks of the events; what is in final blocks is kept as it is proven, unless the node is not honest."""
 
     def commit(next_block: int) -> None:
-        if verifier.honest and final.number > 0:
+        if verifier.keeps and final.number > 0:
             kept.commit(verifier.progress(), next_block, final.number, final.hash)
 
     def finals() -> Iterator[DataEvent]:
@@ -134,7 +138,7 @@ def _keeping(kept: Cache, verifier: Verifier, events: Iterator[DataEvent], final
         yield from events
 
     for chunk in verifier.read(finals()):
-        if chunk.place.block <= final.number and verifier.honest:
+        if chunk.place.block <= final.number and verifier.keeps:
             kept.add(chunk)
             if kept.full:
                 commit(chunk.place.block)

@@ -39,7 +39,7 @@ class Kind(Enum):
     MISSING = "missing", True, "place", "the robot wrote more before this than the chain has"
     FORKED = "forked", True, "place", "the robot's log branches here, or goes back"
     UNTRUSTED = "untrusted", True, "chunk", "no certificate of this robot that is to be trusted governs this"
-    WITHHELD = "withheld", True, "chunk", "counted by the contract and not shown by the node"
+    WITHHELD = "withheld", True, "chunk", "counted by the contract and not shown by node or archive"
     ROLLED_BACK = "rolled-back", True, "place", "what an earlier reading found here is not here now"
     UNOPENABLE = "unopenable", True, "chunk", "the signature holds and the content does not"
     DROPPED = "dropped", False, "record", "dropped by the robot, whose disk was full"
@@ -47,6 +47,7 @@ class Kind(Enum):
     RESTARTED = "restarted", False, "restart", "began anew without having said goodbye"
     NEW_CERTIFICATE = "new-certificate", False, "certificate", "not known to this reader: compare its fingerprint"
     NO_GRANT = "no-grant", False, "record", "not for this reader"
+    ARCHIVED = "archived", False, "record", "in an archive that was not looked into"
     CLOCK = "clock", False, "time", "the robot's clock was not right"
 
     label: str

@@ -12,18 +12,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from eth_utils.crypto import keccak
 
-from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TypeLine, parse_line
-from rosbridge_eth.chunk import Chunk, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id
+from rosbridge_eth.capture import MAX_ARCHIVED_LINE, MAX_LINE, LostLine, MessageLine, StreamLine, TypeLine, parse_line
+
+from rosbridge_eth.chunk import (  # isort: skip
+    Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id, signed_as,
+)  # fmt: skip
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import IdentityError, VerificationError
 from rosbridge_eth.identity import Role, Trust, split_certificates
-from rosbridge_eth.identity import verify as verify_signature
 from rosbridge_eth.reading.verdict import Bookmark, Findings, Governing, Head, Kind, Links, Progress, Verdict, shown
-from smcrypto import CertificateError, InvalidKey, InvalidSignature, sm2, sm3, x509
+from smcrypto import CertificateError, InvalidKey, sm2, sm3, x509
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
@@ -38,6 +40,9 @@ MAX_ELSEWHERE: Final = 16
 NO_DIGEST: Final = bytes(32)
 LAST_MOMENT: Final = 253_402_300_799
 """The end of 9999 in seconds since 1970; what a node says is later is taken for that."""
+
+
+Bodies: TypeAlias = Callable[[bytes, int], bytes | None]
 
 
 class Place(NamedTuple):
@@ -119,6 +124,8 @@ class Verifier:
 
     standing: of the robot, at the block up to which is read. registrations: all of them, oldest first.
     reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
+    bodies: of an archived chunk's body, by its digest and length, what the archive has, None where it has nothing;
+    without it archived records are told and not opened.
     at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
     now, heartbeat: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
     may have chunks of this robot.
@@ -128,9 +135,10 @@ class Verifier:
         self, name: str, ledger: bytes, standing: Standing, registrations: Sequence[RegistrationEvent], *,
         trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
         mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
-        heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (),
+        heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None,
     ) -> None:  # fmt: skip
         self.name, self.log = name, Log(ledger, robot_id(name))
+        self._bodies, self._bodies_withheld = bodies, 0
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
@@ -247,9 +255,11 @@ class Verifier:
         self._at.digest = header.digest.hex()
         if signer is None or signer.key is None:
             raise _Refused(Kind.UNTRUSTED, "no certificate is registered" if signer is None else signer.why)
-        if not is_signed(self.log, signer.key, chunk):
+        try:
+            purpose = signed_as(self.log, signer.key, chunk)
+        except Forged:
             elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
-            raise _Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED)
+            raise _Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
         if header.sealed_ms > signer.ends_ms:
             end = time_text(signer.ends_ms * 10**6)
             raise _Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
@@ -258,11 +268,24 @@ class Verifier:
         self._at.head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
         if chunk.body and sm3.digest(chunk.body) != header.body_digest:
             raise _Refused(Kind.ALTERED, "the body is not the one that the header names")
-        if chunk.dropped:
+        if purpose == "dropped":
             raise _Refused(Kind.DROPPED, count=header.records)
+        if chunk.bare:
+            chunk = replace(chunk, body=self._body(header))
         time = self._time(event.block)
         place = Place(index, header.stream, header.number, header.digest, event.block, time, event.transaction)
         return self._open(place, chunk)
+
+    def _body(self, header: Header) -> bytes:
+        """From the archive. It is refused as withheld where the archive has none, or another."""
+        if self._bodies is None:
+            raise _Refused(Kind.ARCHIVED, count=header.records)
+        body = self._bodies(header.body_digest, header.body_length)
+        if body is None or len(body) != header.body_length or sm3.digest(body) != header.body_digest:
+            self._bodies_withheld += 1
+            what = "is not in the archive" if body is None else "is another in the archive"
+            raise _Refused(Kind.WITHHELD, f"the body {header.body_digest.hex()} {what}")
+        return body
 
     # --- links
 
@@ -323,15 +346,15 @@ class Verifier:
             raise _Refused(Kind.NO_GRANT, count=count) from None
         except Unopenable as error:
             raise _Refused(Kind.UNOPENABLE, shown(str(error))) from None
-        records = tuple(self._parsed(place, lines))
+        records = tuple(self._parsed(place, lines, MAX_ARCHIVED_LINE if chunk.header.archived else MAX_LINE))
         self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
 
-    def _parsed(self, place: Place, lines: Sequence[bytes]) -> Iterator[ProvenRecord]:
+    def _parsed(self, place: Place, lines: Sequence[bytes], most: int) -> Iterator[ProvenRecord]:
         unsynchronised = 0
         for number, line in enumerate(lines):
             try:
-                content = parse_line(line)
+                content = parse_line(line, most)
             except VerificationError as error:
                 self.findings.add(Kind.UNOPENABLE, place.chunk, detail=f"line {number}: {shown(str(error))}")
                 continue
@@ -366,7 +389,12 @@ class Verifier:
     def honest(self) -> bool:
         """Whether the node kept nothing back, and showed again what it showed before."""
         counts = self.findings.counts
-        return not counts[Kind.WITHHELD.label] and not counts[Kind.ROLLED_BACK.label]
+        return counts[Kind.WITHHELD.label] == self._bodies_withheld and not counts[Kind.ROLLED_BACK.label]
+
+    @property
+    def keeps(self) -> bool:
+        """Whether what was read need not be read again: the archive, too, kept nothing back."""
+        return self.honest and not self._bodies_withheld
 
     def progress(self) -> Progress:
         """Where the reading stands, between two chunks. New certificates are not in it: they are told anew."""
@@ -388,9 +416,7 @@ class Verifier:
 
 def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
     """Whether the robot signed this header, for this form of the chunk; the body is looked at afterwards."""
-    purpose = "dropped" if chunk.dropped else "chunk"
     try:
-        verify_signature(key, purpose, log.ledger + log.tk + chunk.header.encoded, chunk.signature)
-    except InvalidSignature:
+        return bool(signed_as(log, key, chunk))
+    except Forged:
         return False
-    return True

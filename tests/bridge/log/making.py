@@ -44,14 +44,14 @@ def signed(header: bytes, body: bytes, purpose: str = "chunk") -> Chunk:
 
 
 def lying(frame: bytes, *, records: int = 1, root: bytes = b"r" * 32, pad: int | None = None, key: bytes = b"k" * 16,
-          sealed_under: bytes | None = None) -> Chunk:  # fmt: skip
+          sealed_under: bytes | None = None, flags: int = 0) -> Chunk:  # fmt: skip
     """A chunk that the robot signed, and whose body holds `frame` and whatever the robot likes."""
     plaintext = frame + bytes(-len(frame) % 64 if pad is None else pad)
     place = STREAM + (3).to_bytes(8, "big")
     body = sm4.SM4GCM(sealed_under or key).encrypt(bytes(12), plaintext, LOG.ledger + LOG.tk + place)
     tag = sm3.digest(place + READER.public_key.to_bytes())[:8]
     header = struct.pack(
-        FIXED, 2, 0, STREAM, 3, bytes(32), 5, records, root, len(body), sm3.digest(body), 1
+        FIXED, 2, flags, STREAM, 3, bytes(32), 5, records, root, len(body), sm3.digest(body), 1
     ) + tag + READER.public_key.encrypt(key, encoding="c1c3c2")  # fmt: skip
     return signed(header, body)
 

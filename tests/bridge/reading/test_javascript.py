@@ -71,7 +71,7 @@ class Written:
     pen: Pen
 
     def write(self, *chunks: Any) -> None:
-        encoded = [chunk if isinstance(chunk, bytes) else chunk.encoded for chunk in chunks]
+        encoded = [chunk if isinstance(chunk, bytes) else chunk.on_chain.encoded for chunk in chunks]
         self.ledger.set_data(KEYS.robot(1), self.pen.log.tk, encoded)
 
 
@@ -93,10 +93,16 @@ class Both:
     records: list[dict[str, Any]]
 
 
-def both(chain: Written, verifier: list[str], tmp_path: Path, key: bool = True) -> Both:
+def both(
+    chain: Written, verifier: list[str], tmp_path: Path, key: bool = True, archive: Path | None = None
+) -> Both:
+    def body(digest: bytes, length: int) -> bytes | None:
+        file = (archive or tmp_path) / digest.hex()[:2] / digest.hex()
+        return file.read_bytes() if file.exists() else None
+
     reading = read_robot(
         [chain.ledger], NAME, trust=Trust([authority().certificate]), now=START.timestamp(),
-        reader=reader().encryption_key if key else None,
+        reader=reader().encryption_key if key else None, bodies=body if archive else None,
     )  # fmt: skip
     mine = [(record.line, record.place.chunk, record.number) for record in reading.records()]
     here = reading.verdict()
@@ -105,6 +111,7 @@ def both(chain: Written, verifier: list[str], tmp_path: Path, key: bool = True) 
     command = [*verifier, "--node", chain.ledger.url, "--contract", chain.ledger.contract]
     command += ["--robot", NAME, "--ca", str(ca)]
     command += ["--key", reader().encryption_key.to_bytes().hex()] if key else []
+    command += ["--archive", str(archive)] if archive else []
     done = subprocess.run(command, capture_output=True, timeout=120)
     assert done.returncode in (0, 9), done.stderr.decode()
     there = json.loads(done.stderr)
@@ -161,6 +168,23 @@ def test_several_readers_and_a_certificate_that_changes(chain, verifier, tmp_pat
 def test_without_a_key(chain, verifier, tmp_path):
     chain.write(*chain.pen.chunks(3, records=2))
     assert both(chain, verifier, tmp_path, key=False).there["counts"] == {"no-grant": 6}
+
+
+def test_an_archive(chain, verifier, tmp_path):
+    pen = chain.pen
+    chunks = [pen.write(message(n, image=100_000 * "QUJD"), archived=True) for n in range(4)]
+    dropped = pen.drop(pen.write(message(9), archived=True))
+    chain.write(*chunks, dropped, *pen.chunks(1, goodbye=True))
+    folder = tmp_path / "bodies"
+    for chunk, spoil in zip(chunks[:3], (b"", b"", b"x"), strict=True):
+        name = chunk.header.body_digest.hex()
+        (folder / name[:2]).mkdir(parents=True, exist_ok=True)
+        (folder / name[:2] / name).write_bytes(chunk.body + spoil)
+    read = both(chain, verifier, tmp_path, archive=folder)
+    assert read.there["counts"] == {"withheld": 2, "dropped": 1} and not read.there["sound"]
+    assert [record["data"]["x"] for record in read.records] == [0, 1, 5]
+    unseen = both(chain, verifier, tmp_path)
+    assert unseen.there["counts"] == {"archived": 4, "dropped": 1} and unseen.there["sound"]
 
 
 def test_what_is_wrong_is_called_by_the_same_name(chain, verifier, tmp_path):

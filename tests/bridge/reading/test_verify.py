@@ -147,6 +147,78 @@ def test_the_contracts_hash_of_the_last_chunk_is_held_against_it():
     assert read(data=data, stands=stands).only(Kind.ALTERED).first == 2
 
 
+# --- the archive
+
+
+def archive_of(*chunks: Chunk) -> dict[bytes, bytes]:
+    return {chunk.header.body_digest: chunk.body for chunk in chunks}
+
+
+def looked_up(bodies: dict[bytes, bytes]):
+    return lambda digest, length: bodies.get(digest)
+
+
+def archived_log() -> list[Chunk]:
+    pen = Pen()
+    return [pen.write(message(0)), pen.write(message(1), message(2), archived=True), pen.write(message(3)),
+            pen.write(message(4), archived=True, goodbye=True)]  # fmt: skip
+
+
+def test_archived_chunks_are_read_from_the_archive_as_the_others_from_the_chain():
+    chunks = archived_log()
+    result = read(chunks, bodies=looked_up(archive_of(*chunks)))
+    assert result.found == [] and result.verdict.sound
+    assert result.numbers == [0, 1, 2, 3, 4]
+    assert [each.chunk for each in result.chunks] == chunks  # with the bodies: proofs of records can be made of them
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda bodies, digest: bodies.pop(digest), "is not in the archive"),
+        (lambda bodies, digest: bodies.update({digest: bodies[digest][:-1] + b"x"}), "is another in the archive"),
+        (lambda bodies, digest: bodies.update({digest: b""}), "is another in the archive"),
+        (lambda bodies, digest: bodies.update({digest: bodies[digest] + b"x"}), "is another in the archive"),
+    ],
+    ids=["gone", "altered", "empty", "longer"],
+)
+def test_a_body_that_the_archive_has_no_more_is_withheld_and_hides_nothing_else(spoil, said):
+    chunks = archived_log()
+    bodies, digest = archive_of(*chunks), chunks[1].header.body_digest
+    spoil(bodies, digest)
+    for key in (reader(), None):
+        result = read(chunks, bodies=looked_up(bodies), key=key, keyless=key is None)
+        told = [one for one in result.verdict.findings if one.kind is not Kind.NO_GRANT]
+        assert [(one.kind, one.first, one.last, one.count) for one in told] == [(Kind.WITHHELD, 1, 1, 1)]
+        assert told[0].detail == f"the body {digest.hex()} {said}"
+        assert not result.verdict.sound
+    assert read(chunks, bodies=looked_up(bodies)).numbers == [0, 3, 4]
+    mark = result.verifier.bookmark()  # the chain kept nothing back: that its end was seen is not forgotten
+    assert mark is not None and mark.count == 4 and result.verifier.honest and not result.verifier.keeps
+
+
+def test_without_an_archive_its_records_are_told_and_nothing_is_said_against_them():
+    result = read(archived_log())
+    assert result.verdict.sound and result.numbers == [0, 3]
+    assert result.found == [("archived", 1, 3, 3)]
+
+
+def test_an_archived_chunk_that_the_robot_dropped_is_not_looked_for():
+    pen = Pen()
+    dropped = pen.drop(pen.write(message(1), message(2), archived=True))
+    asked: list[bytes] = []
+    result = read([dropped, *pen.chunks(1)], bodies=lambda digest, length: asked.append(digest))
+    assert result.found == [("dropped", 0, 0, 2)] and not asked
+
+
+def test_an_archived_header_that_nobody_signed_is_forged_and_not_looked_for():
+    chunk = Pen().write(message(1), archived=True)
+    stranger = replace(chunk, signature=bytes(63) + b"\1")
+    asked: list[bytes] = []
+    assert read([stranger], bodies=lambda digest, length: asked.append(digest)).only(Kind.FORGED).first == 0
+    assert not asked
+
+
 # --- what is not there
 
 

@@ -126,7 +126,7 @@ def test_a_disk_that_the_spool_itself_fills_takes_the_new_at_the_expense_of_the_
         spool.append(one)
     found = all_of(spool)
     assert found[-1].header.number == 1499
-    whole = [one for one in found if not one.dropped]
+    whole = [one for one in found if not one.bare]
     assert numbers(whole) == list(range(1500 - len(whole), 1500))
     assert len(whole) > 100
     statistics = spool.statistics()

@@ -164,7 +164,7 @@ def test_then_the_bodies_of_the_oldest_which_are_still_sent_in_the_form_that_was
     made = fill(spool, 6, size=4000)
     sent = spool.following(STREAM, None, PLENTY)
     assert numbers(sent) == list(range(6))
-    gone = [number for number, form in enumerate(sent) if form.dropped]
+    gone = [number for number, form in enumerate(sent) if form.bare]
     assert gone == list(range(len(gone)))
     assert sent == [dropped(made[n]) if n in gone else made[n] for n in range(6)]
     statistics = spool.statistics()
@@ -180,7 +180,7 @@ def test_then_the_headers_of_the_oldest_so_that_bodies_keep_most_of_the_room(pat
     fill(spool, 200, size=4000)
     sent = spool.following(STREAM, None, PLENTY)
     assert numbers(sent) == list(range(200 - len(sent), 200))
-    whole = [form for form in sent if not form.dropped]
+    whole = [form for form in sent if not form.bare]
     assert len(whole) >= 7
     statistics = spool.statistics()
     assert statistics.dropped_headers == 200 - len(sent) > 0
