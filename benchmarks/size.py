@@ -26,7 +26,7 @@ PARTS = {
         "identity.py", "home.py", "files.py", "registry.py", "administration.py", "bundle.py", "errors.py",
         "passphrases.py", "__init__.py",
     ),
-    "capture": ("capture",),
+    "capture": ("capture", "blackbox.py"),
     "sources": ("sources",),
     "chunk": ("chunk.py", "writer.py", "protocol.py"),
     "channel": ("channel",),

@@ -72,7 +72,8 @@ def _kind(value: dict[str, Any]) -> str:
     if "anyOf" in value:
         return " or ".join(_kind(one) for one in value["anyOf"] if one.get("type") != "null")
     if value.get("type") == "array":
-        return "names or tables" if "$ref" in value["items"] else f"list of {_kind(value['items'])}"
+        tables = "names or tables" if value["items"].get("$ref", "").endswith("TopicConfig") else "tables"
+        return tables if "$ref" in value["items"] else f"list of {_kind(value['items'])}"
     bounds = [f"{words} {value[name]}" for name, words in _BOUNDS.items() if name in value]
     return ", ".join([_WORDS.get(value.get("type", "table"), value.get("type", "table")), *bounds])
 

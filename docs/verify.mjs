@@ -213,7 +213,7 @@ const end = Number(standing.chunks)
 
 const findings = []
 const told = (kind, chunk, detail = '', count = 1) => findings.push({ kind, chunk, count, detail })
-const NOTICES = new Set(['dropped', 'lost', 'restarted', 'no-grant', 'archived', 'clock'])
+const NOTICES = new Set(['dropped', 'lost', 'triggered', 'restarted', 'no-grant', 'archived', 'clock'])
 const times = new Map()
 const timeOf = async (n) => {
   if (!times.has(n)) times.set(n, (await provider.getBlock(n)).timestamp)
@@ -305,6 +305,7 @@ async function prove(data, at, event) {
       continue
     }
     if (value.lost !== undefined) told('lost', at, '', value.lost)
+    if (value.trigger !== undefined) told('triggered', at)
     if (value.topic === undefined || value.data === undefined) continue
     const proof = { chunk: at, record: n, digest: header.digest, block: event.blockNumber, transaction: event.transactionHash }
     // The line itself and not what was parsed of it: JavaScript's numbers would lose digits of the times.

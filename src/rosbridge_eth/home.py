@@ -25,6 +25,7 @@ A robot's home (made by `join`):
     identity/            its keys, under its own password, its certificates, and the CA's
     readers/NAME.pem     who may read what it writes
     spool.sqlite         its replica of its log
+    NAME.fire            an event that `trigger NAME` asks for; the robot takes it within a second and removes it
     clock                the latest time the server proved (seconds since 1970), for robots without a clock battery
 
 A reader's home (made by `init` or `reader`, to be carried to the machine that reads):
@@ -221,6 +222,10 @@ class RobotHome:
     def answer(self) -> Path:
         """Where the bundle that answers the request is put, for `robot` to take up."""
         return self.path / f"{home_of(self.path, HomeKind.ROBOT)['name']}.bundle"
+
+    def event(self, trigger: str) -> Path:
+        """The file that asks for it."""
+        return self.path / f"{trigger}.fire"
 
     def save_bridge(self, end: BridgeEnd) -> None:
         _save(self.bridge_file, asdict(end))

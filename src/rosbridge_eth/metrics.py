@@ -78,6 +78,9 @@ DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the home is.", "process"
 
 CAPTURED = _gauge("captured", "Records captured since the robot was started.", "robot")
 LOST = _gauge("lost", "Messages not captured, by topic and why; the log says so, too.", "robot", "topic", "why")
+FIRED = _gauge("trigger_fired", "Events since the robot was started.", "robot", "trigger")
+KEPT = _gauge("trigger_records", "Records in memory for the next event.", "robot", "trigger")
+KEPT_BYTES = _gauge("trigger_bytes", "Bytes that these count, of the trigger's `memory`.", "robot", "trigger")
 SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored there, set aside.", "robot", "state")
 SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.", "robot")
 SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave up since it was made.", "robot")
@@ -314,7 +317,11 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     beat("robot", wall)
     show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
     CAPTURED.labels(name).set(robot.captured)
-    for (topic, why), count in {**robot.source.lost, **robot.capture.lost}.items():
+    for trigger in robot.box.triggers.values():
+        FIRED.labels(name, trigger.rule.name).set(trigger.fired)
+        KEPT.labels(name, trigger.rule.name).set(len(trigger.ring))
+        KEPT_BYTES.labels(name, trigger.rule.name).set(trigger.ring.bytes)
+    for (topic, why), count in robot.lost.items():
         LOST.labels(name, topic, why).set(count)
     spool = robot.spool.statistics()
     for state, chunks in (("all", spool.chunks), ("not stored", spool.unstored), ("set aside", spool.aside)):

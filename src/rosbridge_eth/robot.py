@@ -14,7 +14,7 @@ import os
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -22,6 +22,7 @@ from pathlib import Path
 from socket import socket as Socket
 from typing import TypeVar
 
+from rosbridge_eth.blackbox import BlackBox, Record
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
@@ -65,12 +66,14 @@ class Robot:
 
     def __init__(
         self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, socket: Socket,
-        sender: Sender,
+        sender: Sender, box: BlackBox | None = None,
     ) -> None:  # fmt: skip
-        self.capture, self.writer, self.spool = capture, writer, spool
+        self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
         self.client, self.sender, self.loop = client, sender, UdpLoop(client, socket, self.handle)
         sender.begin_stream = self.begin_stream
-        self.source, self.captured, self.chunks = source, 0, 0
+        self.source, self.chunks = source, 0
+        self.written = Counter[str]()
+        """Records given to the writer, by topic."""
         self._ring: deque[RawMessage] = deque()
         self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
@@ -89,9 +92,24 @@ class Robot:
     def take_up(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
         """Go on by other topics, nodes and [capture], and seal for these readers; to be called in the loop's thread."""
         self._add_losses(time.monotonic())
+        self.box.take_up(config.triggers())
         self.capture.take_up(config.rules())
         self.source.watch(config.selection())
         self.writer.take_up(readers)
+
+    def fire(self, why: str, name: str | None = None) -> None:
+        """An event of this trigger, or of all, by hand; to be called in the loop's thread."""
+        self.box.fire(time.time_ns() if self.source.live else self.box.newest_ns, why, name)
+
+    @property
+    def lost(self) -> dict[tuple[str, str], int]:
+        """Messages that are not in the log, by topic and why: lost by the source, refused, no memory to keep them."""
+        return {**self.source.lost, **self.capture.lost, **self.box.lost}
+
+    @property
+    def captured(self) -> int:
+        """Records given to the writer; what is kept in memory for an event is not among them."""
+        return self.written.total()
 
     def begin_stream(self, refused: bytes) -> None:
         """The server refused a stream: if it is the one being written, go on in a new one."""
@@ -111,7 +129,7 @@ class Robot:
             while not self._stop.is_set():
                 now = time.monotonic()
                 self._take(now)
-                if not finished and self._source_ended.is_set() and not self._ring:
+                if not finished and self._source_ended.is_set() and not self._ring and not self.box.released:
                     finished = True
                     self._finish(now)
                 elif not finished:
@@ -122,7 +140,7 @@ class Robot:
                     break
                 self.loop.step(self._wait(now, finished))
             else:
-                while self._ring and len(self._unspooled) < MAX_UNSPOOLED:
+                while (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
                     self._take(time.monotonic())
                 if not finished:
                     self._finish(time.monotonic())
@@ -165,21 +183,38 @@ class Robot:
         if now - self._synchronised_at > SYNCHRONISED_EVERY:
             self._synchronised, self._synchronised_at = clock_synchronised(), now
         for _ in range(TAKE):
-            if not self._ring or len(self._unspooled) >= MAX_UNSPOOLED:
+            if len(self._unspooled) >= MAX_UNSPOOLED:
                 break
-            raw = self._ring.popleft()
-            record = self.capture.process(raw, time.time_ns(), self._synchronised)
-            if record is not None:
-                self.writer.add(record.line, now, (raw.type_name, definition_line(raw.decoder)))
-                self.captured += 1
+            if self.box.released:  # before anything new, so that no more is kept than was stated
+                self._write(self.box.released.popleft(), now)
+            elif self._ring:
+                self._capture(self._ring.popleft(), now)
+            else:
+                break
         if len(self._ring) < RING // 2:
             self._room.set()
         if now - self._losses_at >= LOSSES_EVERY:
             self._losses_at = now
             self._add_losses(now)
 
+    def _capture(self, raw: RawMessage, now: float) -> None:
+        self.box.look(raw)
+        captured = self.capture.process(raw, time.time_ns(), self._synchronised)
+        if captured is None:
+            return
+        record = Record(raw.topic, raw.received_ns, captured.line, (raw.type_name, definition_line(raw.decoder)))
+        if captured.trigger is None:
+            self._write(record, now)
+        else:
+            self.box.keep(captured.trigger, record)
+
+    def _write(self, record: Record, now: float) -> None:
+        self.writer.add(record.line, now, record.definition)
+        if record.definition is not None:  # else it is no message
+            self.written[record.topic] += 1
+
     def _add_losses(self, now: float) -> None:
-        for line in self.capture.loss_lines(self.source.lost):
+        for line in self.capture.loss_lines({**self.source.lost, **self.box.lost}):
             self.writer.add(line, now)
 
     def _finish(self, now: float) -> None:
@@ -203,7 +238,7 @@ class Robot:
             self.spool_trouble.now(None)
 
     def _wait(self, now: float, finished: bool) -> float:
-        if self._ring and len(self._unspooled) < MAX_UNSPOOLED:
+        if (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
             return 0.0
         due = LONGEST_WAIT if finished else self.writer.next_timer() - now
         return max(0.0, min(LONGEST_WAIT, due))
@@ -241,6 +276,7 @@ class Robot:
         lost = {
             "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
+            "records that there was no memory for until their event": self.box.lost.total(),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }
@@ -288,9 +324,11 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     settings, _ = config.source_and_why(os.environ)
     source = open_source(settings, config.selection())
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
+    box = BlackBox(config.triggers())
     for topic, decoders in source.decoders().items():
         for decoder in decoders:
             capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message
+            box.check(topic, decoder)
     if isinstance(source, BagSource):
         _say_what_is_outside(config.rules(), source.span)
     place = Log(end.ledger, robot_id(identity.name))
@@ -309,19 +347,21 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     sender = Sender(client, spool, channel=config.channel, on_server_time=home.raise_clock_floor)
     socket, address = client_socket(config.server or parse_address(end.server_address))
     robot = Robot(
-        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender
+        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender,
+        box=box,
     )
     client.connect(address, now)
     return robot
 
 
 def read_again(robot: Robot, home: RobotHome, running: RobotConfig, file: Path) -> RobotConfig:
-    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, [capture] and
-    readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from now on.
+    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, triggers,
+    [capture] and readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from
+    now on.
 
     What cannot be used is told, and nothing changes.
     """
-    keys = [*(("topics", "nodes") if robot.source.live else ()), "capture", "readers"]
+    keys = [*(("topics", "nodes", "trigger") if robot.source.live else ()), "capture", "readers"]
     try:
         config, said = reread(running, load_robot_config(file), keys)
         roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())

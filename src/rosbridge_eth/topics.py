@@ -3,7 +3,8 @@
 A live source is listened to for some seconds; a bag or a simulation is read as fast as it goes, for as long at most.
 The messages are captured, written and sealed as a robot does it, with keys that are thrown away: sizes are measured,
 only the way from there to a day is arithmetic. A topic's cost is that of its records alone, compressed; the headers of
-chunks and the transactions come once, with the total. What was heard once costs nothing a day.
+chunks and the transactions come once, with the total. What was heard once costs nothing a day, and so does what is
+written only when a trigger's event happens.
 """
 
 from __future__ import annotations
@@ -82,12 +83,18 @@ class Heard:
     times: list[int] = field(default_factory=list)
     size: int = 0
     lines: list[tuple[float, bytes]] = field(default_factory=list)
+    trigger: str | None = None
 
     @property
     def rate(self) -> float | None:
         """Messages a second; None where there were not two."""
         span = self.times[-1] - self.times[0] if self.times else 0
         return (len(self.times) - 1) * 1e9 / span if span > 0 else None
+
+    @property
+    def all_day(self) -> list[tuple[float, bytes]]:
+        """The lines of a topic that comes again and again."""
+        return self.lines if self.rate and not self.trigger else []
 
 
 def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, Any]:
@@ -103,6 +110,7 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
         topic.times.append(raw.received_ns)
         topic.size += len(raw.raw)
         if record := capture.process(raw, raw.received_ns):
+            topic.trigger = record.trigger
             topic.lines.append((raw.received_ns / 1e9, record.line))
             room[0] -= len(record.line)
         if room[0] < 0:
@@ -120,15 +128,16 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     took = time.monotonic() - began if source.live else (max(times) - min(times)) / 1e9 if times else 0.0
     selection, days = config.selection(), max(took, 1.0) / DAY
     chosen = [topic for topic in heard.values() if selection.wants(topic.offer)]
-    chunks = _sealed([line for topic in chosen if topic.rate for line in topic.lines], config, source.kind, readers)
+    chunks = _sealed([line for topic in chosen for line in topic.all_day], config, source.kind, readers)
     sizes, alone = [len(chunk.encoded) for chunk in chunks], set_data_gas([])
     full = set_data_gas(sizes) - alone + alone * sum(sizes) / BATCH_BYTES
-    bodies = {name: sum(len(chunk.body) for chunk in _sealed(topic.lines if topic.rate else [], config, source.kind,
-                                                             readers)) for name, topic in heard.items()}  # fmt: skip
+    bodies = {name: sum(len(chunk.body) for chunk in _sealed(topic.all_day, config, source.kind, readers))
+              for name, topic in heard.items()}  # fmt: skip
     return {
         "seconds": took,
         "topics": [
-            {"topic": name, "type": topic.offer.type_name, "nodes": list(topic.offer.nodes), "chosen": topic in chosen,
+            {"topic": name, "type": topic.offer.type_name, "nodes": list(topic.offer.nodes),
+             "chosen": topic in chosen, "trigger": topic.trigger,
              "messages": (count := len(topic.times)), "rate": topic.rate, "size": topic.size / count if count else None,
              "bytes_per_day": bodies[name] / days, "gas_per_day": GAS_A_BYTE * bodies[name] / days}
             for name, topic in sorted(heard.items())
@@ -186,7 +195,8 @@ def topics(
     columns = ["topic", "type", "Hz", "bytes", "taken", "MB a day", "Ggas a day"]
     rows = [
         (each["topic"], each["type"], "" if each["rate"] is None else f"{each['rate']:.3g}",
-         "" if each["size"] is None else f"{each['size']:.0f}", "yes" if each["chosen"] else "",
+         "" if each["size"] is None else f"{each['size']:.0f}",
+         f"at {each['trigger']}" if each["trigger"] else "yes" if each["chosen"] else "",
          f"{each['bytes_per_day'] / 1e6:.3g}", f"{each['gas_per_day'] / 1e9:.3g}")
         for each in report["topics"]
     ]  # fmt: skip

@@ -44,6 +44,9 @@ urlopen(Request("{}", json.dumps(body).encode(), dict([("Content-Type", "applica
 """Puts 100 ETH on the account that `init` names, as its owner would."""
 
 
+SERVER = "rosbridge-eth server 2> server.log &\nuntil grep -q Listening server.log; do sleep 0.2; done"
+
+
 @pytest.fixture(scope="module")
 def made(require: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Anvil]]:
     """What the walkthrough leaves: homes of an operator, a robot and a reader, and a chain that has the contract."""
@@ -88,7 +91,7 @@ def test_ros_1(place: Path, require: Callable[[str], str]):
     shutil.copy(sample_bag(), place / "robot_1.bag")
     said = type_page(
         "howto-ros1.md", place, ports={"11311": free_port()}, environment={"ROS_LOG_DIR": str(place)},
-        before="rosbridge-eth server 2> server.log &\nuntil grep -q Listening server.log; do sleep 0.2; done",
+        before=SERVER,
     )
     captured = re.search(r"(\d+) records captured", said)
     assert captured and int(captured[1]) == 300, said[-3000:]
@@ -102,6 +105,11 @@ def test_ros_2(place: Path):
     publish.write_text(f'#!/bin/sh\nexec "{python}" "{ROOT / "tests/bridge/sources/ros2/topic_pub.py"}" "$@"\n')
     publish.chmod(0o755)
     type_page("howto-ros2.md", place, ports={"7": free_domain(44)}, python=python)
+
+
+def test_black_box(place: Path):
+    (place / "robot" / "robot.toml").unlink()
+    type_page("howto-black-box.md", place, before=SERVER)
 
 
 def test_redis(place: Path, require: Callable[[str], str]):

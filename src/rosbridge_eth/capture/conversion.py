@@ -38,7 +38,7 @@ from rosbridge_eth.capture.rules import DEFAULT_LIMIT, OversizePolicy, Selection
 from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
 
-_BYTES: Final = frozenset({"uint8", "char", "byte"})
+BYTES: Final = frozenset({"uint8", "char", "byte"})
 NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
     f"{kind}{bits}": f"<{letter}{bits // 8}"
     for kind, letter in (("int", "i"), ("uint", "u"), ("float", "f"))
@@ -170,7 +170,7 @@ class Conversion:
 
     def _numbers(self, base: str, path: str) -> Callable[[Any], Any]:
         wire = numpy.dtype(NUMPY[base])
-        longest, binary, real = self._limit // wire.itemsize, base in _BYTES, base in ("float32", "float64")
+        longest, binary, real = self._limit // wire.itemsize, base in BYTES, base in ("float32", "float64")
 
         def convert(value: Any) -> Any:
             if len(value) > longest:

@@ -4,6 +4,7 @@
                    "captured_ns":1763...,"clock":true,"data":{...}}
     a type        {"type":"nav_msgs/msg/Odometry","wire":"ros1","format":"msg","definition":"..."}
     a loss        {"lost":3,"topic":"/scan","why":"dropped"}
+    an event      {"trigger":"crash","why":"/bumper data == true","at_ns":1763...}
     a stream      {"stream":{"source":"ros1","software":"rosbridge_eth 2.0"}}
 
 Canonical: no white space, members in this order (of `data`, in that of the definition), no name twice, strings with
@@ -79,6 +80,14 @@ class LostLine(NamedTuple):
     why: str
 
 
+class TriggerLine(NamedTuple):
+    """An event at this time (as received_ns), for which records that were kept in memory follow."""
+
+    trigger: str
+    why: str
+    at_ns: int
+
+
 class StreamLine(NamedTuple):
     """The first line of a stream: the kind of source, and the software with its version."""
 
@@ -86,7 +95,7 @@ class StreamLine(NamedTuple):
     software: str
 
 
-Line: TypeAlias = MessageLine | TypeLine | LostLine | StreamLine
+Line: TypeAlias = MessageLine | TypeLine | LostLine | TriggerLine | StreamLine
 
 _FORMS: Final[dict[tuple[str, ...], tuple[Any, tuple[type, ...]]]] = {
     (): (None, ()),
@@ -94,6 +103,7 @@ _FORMS: Final[dict[tuple[str, ...], tuple[Any, tuple[type, ...]]]] = {
         (MessageLine, (str, str, str, int, int, bool, dict)),
     ("type", "wire", "format", "definition"): (TypeLine, (str, str, str, str)),
     ("lost", "topic", "why"): (LostLine, (int, str, str)),
+    ("trigger", "why", "at_ns"): (TriggerLine, (str, str, int)),
     ("source", "software"): (StreamLine, (str, str)),
 }  # fmt: skip
 
@@ -108,6 +118,11 @@ def definition_line(decoder: Decoder) -> bytes:
 def lost_line(count: int, topic: str, why: str) -> bytes:
     """The line for messages that are not in the log."""
     return orjson.dumps({"lost": count, "topic": topic, "why": why})
+
+
+def trigger_line(trigger: str, why: str, at_ns: int) -> bytes:
+    """The line before what is written because of an event."""
+    return orjson.dumps({"trigger": trigger, "why": why, "at_ns": at_ns})
 
 
 def stream_line(source_kind: str, software: str) -> bytes:
@@ -133,7 +148,8 @@ def parse_line(line: bytes, most: int = MAX_LINE) -> Line:
     members = value["stream"] if is_stream else value
     form, kinds = _FORMS.get(tuple(members) if isinstance(members, dict) else (), _FORMS[()])
     if form is None or (form is StreamLine) != is_stream:
-        raise VerificationError("a record has not the members of a message, a type, a loss or a stream, in order")
+        kinds_of_lines = "a message, a type, a loss, an event or a stream"
+        raise VerificationError(f"a record has not the members of {kinds_of_lines}, in order")
     for (name, found), kind in zip(members.items(), kinds, strict=True):
         # A time of more than 64 bits was read as a double.
         if type(found) is not kind or (isinstance(found, int) and not 0 <= found < 1 << 63):

@@ -23,7 +23,8 @@ from rosbridge_eth.errors import ConfigError
 
 MAX_CONVERSIONS: Final = 8
 """Of one topic, for as many types or definitions; a publisher may bring another one with each of its connections."""
-_LAST_TIME: Final = 2**63 - 1
+LAST_TIME: Final = 2**63 - 1
+"""Nanoseconds since 1970, in a line."""
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ _LOSSES: Final = frozenset(Cause) - {Cause.FIELD_DIGESTED}
 
 
 class Captured(NamedTuple):
-    """What became of a message: `line` is the record; data is JSON-ready, see conversion."""
+    """What became of a message: `line` is the record; data is JSON-ready, see conversion; trigger as in its rule."""
 
     topic: str
     type_name: str
@@ -50,6 +51,7 @@ class Captured(NamedTuple):
     line: bytes
     decoder: Decoder
     data: dict[str, Any]
+    trigger: str | None = None
 
 
 @dataclass
@@ -100,7 +102,7 @@ class Capture:
         try:
             conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
             digested_before = conversion.digested
-            if not 0 <= raw.received_ns <= _LAST_TIME:
+            if not 0 <= raw.received_ns <= LAST_TIME:
                 raise DecodeError(f"its receive time is {raw.received_ns}")
             data = conversion.convert(raw.decoder.decode(raw.raw))
         except ConfigError as error:
@@ -124,7 +126,7 @@ class Capture:
             self._count(raw.topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
         topic.schedule.captured(raw.received_ns)
         self.counts[raw.topic, "captured"] += 1
-        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data)
+        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data, topic.rule.trigger)
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if the topic's rule does not fit the type."""

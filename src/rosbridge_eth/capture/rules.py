@@ -37,6 +37,7 @@ class TopicRule:
     from_ns, until_ns: only messages received in [from, until).
     for_ns: length of the period: from `from_ns`, or from the first message if that is None.
     oversize, limit: what becomes of a field above `limit` bytes.
+    trigger: records are kept in memory until this event; None: they are written.
     """
 
     topic: str
@@ -49,6 +50,7 @@ class TopicRule:
     for_ns: int | None = None
     oversize: OversizePolicy = "digest"
     limit: int = DEFAULT_LIMIT
+    trigger: str | None = None
 
 
 class Schedule:

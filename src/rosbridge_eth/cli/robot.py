@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
@@ -40,11 +40,13 @@ SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS
 """Kinds of source, as a person is told of them."""
 PLUMBING = {"/rosout", "/rosout_agg", "/parameter_events", "/clock"}
 """Topics of ROS itself; they are taken only where they are named."""
+TAKEN_WITHIN = 10.0  # seconds for a running robot to see what `trigger` asks for; it looks once a second
 
 
 def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth join --name robot_1 --source ros1 --topic /odom")(join)
     app.command(epilog="Example: rosbridge-eth robot --home robot --verbose")(robot)
+    app.command(epilog="Example: rosbridge-eth trigger crash")(trigger)
 
 
 def join(
@@ -136,7 +138,7 @@ def robot(
 ) -> None:
     """Watch the configured topics and bring what they say to the server, until stopped or the source ends.
 
-    SIGHUP: topics, nodes, [capture] and readers are read again.
+    SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
     from rosbridge_eth import metrics
     from rosbridge_eth.robot import open_robot, read_again
@@ -152,18 +154,21 @@ def robot(
     source, why = settings.source_and_why(os.environ)
     talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
     password = read_passphrase("robot", f"Password of {end.robot}", file=password_file)
-    again, at_terminal = threading.Event(), os.isatty(0)
+    again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
         stack.enter_context(metrics.shared(home))
         running = open_robot(place, settings, password)
+        _asked_for(place, running.box.triggers)  # when nobody was there to take it
 
         def on_signal(number: int, frame: FrameType | None) -> None:
-            if number == signal.SIGHUP and os.isatty(0) == at_terminal:
+            if number == signal.SIGUSR1:
+                event.set()
+            elif number == signal.SIGHUP and os.isatty(0) == at_terminal:
                 again.set()
             else:  # also of a terminal that is gone
                 running.stop()
 
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
             signal.signal(number, on_signal)
         if settings.monitor is not None:
             web = metrics.Web(settings.monitor, ["robot"])
@@ -178,9 +183,14 @@ def robot(
             if again.is_set():
                 again.clear()
                 settings = read_again(running, place, settings, file)
+            if event.is_set():
+                event.clear()
+                running.fire("SIGUSR1")
             with suppress(StoreError):  # which the robot itself tells
                 if beats.due():
                     notify("WATCHDOG=1")
+                    for name in _asked_for(place, running.box.triggers):
+                        running.fire("asked for", name)
                     first()
                     metrics.show_robot(end.robot, running, time.time())
                 show()
@@ -189,6 +199,41 @@ def robot(
         stack.callback(notify, "STOPPING=1")
         running.run(on_turn=on_turn)
     talk(running.summary)
+
+
+def trigger(
+    name: Annotated[str | None, typer.Argument(help="One of them; without it, all.")] = None,
+    home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
+) -> None:
+    """Have the robot that runs with this home write what it keeps in memory, as if the event had happened now."""
+    from rosbridge_eth import metrics
+
+    (place := RobotHome(home)).bridge()
+    nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
+    try:
+        known = [labels["trigger"] for what, labels, _ in metrics.figures(home) if what == "trigger_fired"]
+    except ValueError:
+        raise nobody from None
+    if not known or (name is not None and name not in known):
+        raise ConfigError(f"the robot has no trigger{f' {name}' if name else ''}; it has: {', '.join(known) or 'none'}")
+    wanted = known if name is None else [name]
+    for each in wanted:
+        place.event(each).touch()
+    deadline = time.monotonic() + TAKEN_WITHIN
+    while any(place.event(each).exists() for each in wanted):
+        if time.monotonic() > deadline:
+            _asked_for(place, wanted)
+            raise nobody
+        time.sleep(0.05)
+    talk(f"{', '.join(wanted)}: what was kept is written, and so is what comes next.")
+
+
+def _asked_for(place: RobotHome, triggers: Iterable[str]) -> list[str]:
+    """Those of the triggers that are asked for; they are no more."""
+    asked = [name for name in triggers if place.event(name).exists()]
+    for name in asked:
+        place.event(name).unlink(missing_ok=True)
+    return asked
 
 
 def _first(running: Robot) -> Callable[[], None]:
@@ -207,17 +252,21 @@ def _first(running: Robot) -> Callable[[], None]:
 def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
     """What a person at the terminal sees: topics, chunks, session."""
     now, lost = time.monotonic(), Counter[str]()
-    for (topic, _), count in [*running.source.lost.items(), *running.capture.lost.items()]:
+    for (topic, _), count in running.lost.items():
         lost[topic] += count
-    captured = {topic: count for (topic, what), count in running.capture.counts.items() if what == "captured"}
-    rows = [(topic, f"{rates.of(topic, captured.get(topic, 0), now):.1f}", captured.get(topic, 0), lost[topic])
-            for topic in sorted({*captured, *lost})]  # fmt: skip
+    rows = [(topic, f"{rates.of(topic, running.written[topic], now):.1f}", running.written[topic], lost[topic])
+            for topic in sorted({*running.written, *lost})]  # fmt: skip
+    kept = [
+        f"Trigger {each.rule.name}: {len(each.ring)} records in memory, {each.ring.bytes / 2**20:.1f} of"
+        f" {each.rule.memory / 2**20:.1f} MiB; {each.fired} events." for each in running.box.triggers.values()
+    ]
     spool, sender = running.spool.statistics(), running.sender.statistics
     newest = sender.newest
     where = f" (the last in block {newest.block})" if newest and newest.block else ""
     session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
     return Group(
         table(name, ["topic", "records/s", "records", "lost"], rows, right=[1, 2, 3]),
+        *map(Text, kept),
         Text(
             f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
             f" {spool.chunks - spool.unstored} for the chain, {sender.confirmed} confirmed{where}. Session: {session}."

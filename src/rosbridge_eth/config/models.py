@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, WithJsonSchema
 from pydantic import model_validator as validator
 
+from rosbridge_eth.blackbox import Condition, TriggerRule
 from rosbridge_eth.capture import NamePattern, TopicRule
 from rosbridge_eth.capture.rules import parse_paths
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
@@ -51,6 +52,11 @@ def _pattern(value: str) -> str:
 
 def _field_path(value: str) -> str:
     parse_paths([value])
+    return value
+
+
+def _condition(value: str) -> str:
+    Condition.parse(value)
     return value
 
 
@@ -119,6 +125,8 @@ class TopicConfig(Section):
     until: A period: only messages before then.
 
     for: Length of the period, from `from` or from the first message.
+
+    trigger: The name of a `[[trigger]]`: records are kept in memory and go into the log only when that happens.
     """
 
     topic: Pattern
@@ -129,6 +137,7 @@ class TopicConfig(Section):
     from_: TimeNs | None = Field(default=None, alias="from")
     until: TimeNs | None = None
     for_: DurationNs | None = Field(default=None, alias="for")
+    trigger: Name | None = None
 
     @validator(mode="after")
     def _consistent(self) -> TopicConfig:
@@ -136,11 +145,37 @@ class TopicConfig(Section):
         given = {"from": self.from_, "until": self.until, "for": self.for_, "once": self.once, "rate": self.rate}
         if self.at is not None and (also := [key for key, value in given.items() if value]):
             raise ValueError(f"has both `at` and {', '.join(also)}; a moment is one message, choose one")
+        if self.trigger is not None and (self.at is not None or self.once):
+            raise ValueError("has `trigger` and one message only (`at`, `once`): it would be gone before the event")
         if self.until is not None and self.for_ is not None:
             raise ValueError("has both `until` and `for`; choose one")
         if self.from_ is not None and self.until is not None and self.until <= self.from_:
             raise ValueError("has a period that ends before it begins: `until` is not after `from`")
         return self
+
+
+class TriggerConfig(Section):
+    """An event for which records are kept in memory: when it happens, those of the last `before` are written, and those
+    of the next `after`. Topics say `trigger = NAME`. Memory is empty after a start.
+
+    name: What topics, the command `rosbridge-eth trigger NAME`, the log and `/metrics` call it.
+
+    before: How long records are kept, by the time at which their messages were received.
+
+    after: For so long after an event they are written as they come; another event meanwhile makes it longer.
+
+    memory: Bytes kept, at most: the records' JSON and 256 bytes for each. What has to go early is `lost` for "memory"
+    if an event follows.
+
+    when: Conditions, any of which is the event: a topic that is watched, a field, `==` `!=` `<` `<=` `>` `>=`, and a
+    number, `true`, `false` or a `"string"`. Without one, only the command and SIGUSR1 are.
+    """
+
+    name: Name
+    before: Annotated[float, seconds("1ms", "1h")] = 10.0
+    after: Annotated[float, seconds("1ms", "1h")] = 10.0
+    memory: Annotated[int, size("64 KiB", "4 GiB")] = 16 * MIB
+    when: Annotated[list[Annotated[str, AfterValidator(_condition)]], BeforeValidator(_listed)] = []
 
 
 class CaptureConfig(Section):
@@ -307,6 +342,8 @@ class RobotConfig(Section):
     log: The log (below).
 
     spool: The log on the robot's disk (below).
+
+    trigger: Events for which records are kept in memory, at most 16 (below).
     """
 
     topics: list[Annotated[TopicConfig, BeforeValidator(_table_of_name)]] = []
@@ -319,6 +356,7 @@ class RobotConfig(Section):
     capture: CaptureConfig = CaptureConfig()
     log: LogConfig = LogConfig()
     spool: SpoolConfig = SpoolConfig()
+    trigger: Annotated[list[TriggerConfig], Field(max_length=16)] = []
 
     @validator(mode="after")
     def _consistent(self) -> RobotConfig:
@@ -327,18 +365,40 @@ class RobotConfig(Section):
         names = [topic.topic for topic in self.topics]
         if twice := [name for number, name in enumerate(names) if name in names[:number]]:
             raise ValueError(f"names topic {twice[0]} twice")
+        self._check_triggers()
         if self.readers is not None and not self.readers:
             raise ValueError(
                 "has no reader: nobody could open the records; name a certificate in `readers` or leave the key out"
             )
         return self
 
+    def _check_triggers(self) -> None:
+        events, used = [trigger.name for trigger in self.trigger], {topic.trigger for topic in self.topics} - {None}
+        if twice := [name for number, name in enumerate(events) if name in events[:number]]:
+            raise ValueError(f"names trigger {twice[0]} twice")
+        if unknown := used - {*events}:
+            raise ValueError(f"has a topic with trigger = {unknown.pop()!r}, and no [[trigger]] of that name")
+        if idle := [name for name in events if name not in used]:
+            raise ValueError(f"has a trigger {idle[0]!r} for which no topic is kept; say trigger = {idle[0]!r} at one")
+        watched = [NamePattern(topic.topic) for topic in self.topics]
+        for condition in (condition for rule in self.triggers() for condition in rule.when):
+            if not self.nodes and not any(pattern.matches(condition.topic) for pattern in watched):
+                raise ValueError(f"has a condition on {condition.topic}, which is not watched; add it to `topics`")
+
+    def triggers(self) -> list[TriggerRule]:
+        """For blackbox.BlackBox."""
+        return [
+            TriggerRule(each.name, round(each.before * 1e9), round(each.after * 1e9), each.memory,
+                        tuple(map(Condition.parse, each.when)))
+            for each in self.trigger
+        ]  # fmt: skip
+
     def rules(self) -> list[TopicRule]:
         """For capture.Capture. What a node publishes is captured by the defaults."""
         return [
             TopicRule(
                 topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
-                topic.for_, self.capture.oversize, self.capture.field_limit,
+                topic.for_, self.capture.oversize, self.capture.field_limit, topic.trigger,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
         ]

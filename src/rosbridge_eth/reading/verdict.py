@@ -25,7 +25,7 @@ from rosbridge_eth.files import write_atomically
 from smcrypto import sm2
 
 MAX_FINDINGS: Final = 500
-"""Findings kept one by one; what is above that is counted by kind."""
+"""Findings kept one by one, notices only among the first half; what is above that is counted by kind."""
 MAX_SHOWN: Final = 120
 
 
@@ -44,6 +44,7 @@ class Kind(Enum):
     UNOPENABLE = "unopenable", True, "chunk", "the signature holds and the content does not"
     DROPPED = "dropped", False, "record", "dropped by the robot, whose disk was full"
     LOST = "lost", False, "message", "not captured, says the robot"
+    TRIGGERED = "triggered", False, "event", "what the robot kept in memory for it is written"
     RESTARTED = "restarted", False, "restart", "began anew without having said goodbye"
     NEW_CERTIFICATE = "new-certificate", False, "certificate", "not known to this reader: compare its fingerprint"
     NO_GRANT = "no-grant", False, "record", "not for this reader"
@@ -96,7 +97,7 @@ class Findings:
         known = self._latest.get((kind, detail))
         if known is not None and (not kind.violation or first <= known.last + 1):
             known.last, known.count = max(known.last, last), known.count + count
-        elif len(self.kept) < MAX_FINDINGS:
+        elif len(self.kept) < (MAX_FINDINGS if kind.violation else MAX_FINDINGS // 2):
             found = self._latest[kind, detail] = Finding(kind, first, last, count, detail)
             self.kept.append(found)
 
@@ -277,8 +278,8 @@ class Verdict:
         yield f"  {self.records:,} record{'' if self.records == 1 else 's'} proven{counts}"
         yield from (f"  certificate {certificate}" for certificate in self.certificates)
         yield from (f"  {finding}" for finding in self.findings)
-        if len(self.findings) >= MAX_FINDINGS:
-            yield f"  only the first {MAX_FINDINGS} findings are listed; the counts above are whole"
+        if len(self.findings) >= MAX_FINDINGS // 2:
+            yield f"  only the first {len(self.findings)} findings are listed; the counts above are whole"
         yield from (f"  {node}" for node in self.nodes)
 
     def as_json(self) -> dict[str, Any]:

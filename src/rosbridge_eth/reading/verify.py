@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from eth_utils.crypto import keccak
 
-from rosbridge_eth.capture import MAX_ARCHIVED_LINE, MAX_LINE, LostLine, MessageLine, StreamLine, TypeLine, parse_line
-
+from rosbridge_eth.capture import (  # isort: skip
+    MAX_ARCHIVED_LINE, MAX_LINE, LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line,
+)  # fmt: skip
 from rosbridge_eth.chunk import (  # isort: skip
     Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id, signed_as,
 )  # fmt: skip
@@ -368,6 +369,9 @@ class Verifier:
                 case LostLine():
                     detail = f"{shown(content.topic)}: {shown(content.why)}"
                     self.findings.add(Kind.LOST, place.chunk, count=content.lost, detail=detail)
+                case TriggerLine():
+                    detail = f"{shown(content.trigger)}: {shown(content.why)}, {time_text(content.at_ns)}"
+                    self.findings.add(Kind.TRIGGERED, place.chunk, detail=detail)
                 case StreamLine():
                     pass
         if unsynchronised:

@@ -16,12 +16,14 @@ from rosbridge_eth.capture import (
     LostLine,
     MessageLine,
     StreamLine,
+    TriggerLine,
     TypeLine,
     Wire,
     decoder_for,
     definition_line,
     parse_line,
     stream_line,
+    trigger_line,
 )
 from rosbridge_eth.capture.definitions import MAX_KEPT
 from rosbridge_eth.errors import VerificationError
@@ -36,10 +38,12 @@ MESSAGE = MessageLine(
 TYPE = b'{"type":"a/msg/B","wire":"ros1","format":"msg","definition":"int32 x\\n"}'
 
 
-def test_the_four_kinds_of_line():
+def test_the_five_kinds_of_line():
     assert parse_line(LINE) == MESSAGE
     assert parse_line(TYPE) == TypeLine("a/msg/B", "ros1", "msg", "int32 x\n")
     assert parse_line(b'{"lost":3,"topic":"/a","why":"dropped"}') == LostLine(3, "/a", "dropped")
+    assert trigger_line("crash", "/b data == true", 7) == b'{"trigger":"crash","why":"/b data == true","at_ns":7}'
+    assert parse_line(trigger_line("crash", "SIGUSR1", 7)) == TriggerLine("crash", "SIGUSR1", 7)
     assert stream_line("ros1", "rosbridge_eth 2.0") == b'{"stream":{"source":"ros1","software":"rosbridge_eth 2.0"}}'
     assert parse_line(stream_line("ros1", "rosbridge_eth 2.0")) == StreamLine("ros1", "rosbridge_eth 2.0")
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-import rosbridge_eth
-from bridge.lone_robot import CA, NOW, READER, chunks_of, command, lines_of, lone_robot
+from bridge.lone_robot import CA, NOW, READER, chunks_of, command, environment, lines_of, lone_robot
 from bridge.sources.ros1.graph import Graph, eventually
 from rosbridge_eth import identity as ids
 from rosbridge_eth.home import RobotHome
@@ -24,11 +23,6 @@ LATE = ids.enrol(CA, ids.Role.READER, "late", at=NOW)
 @pytest.fixture
 def robot(tmp_path: Path) -> RobotHome:
     return lone_robot(tmp_path)
-
-
-def environment(**more: str) -> dict[str, str]:
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("ROS")}
-    return kept | {"PYTHONPATH": str(Path(rosbridge_eth.__file__).parents[1])} | more
 
 
 @pytest.mark.service
@@ -60,7 +54,7 @@ def test_topics_and_readers_are_taken_up_and_no_message_is_lost(
         robot.config.write_text(f'topics = ["/kept", "/new"]\nserver = "192.0.2.1:9"\n{source}')
         process.send_signal(signal.SIGHUP)
         eventually(lambda: graph.subscribers("/new") and not graph.subscribers("/left"), "the topics are taken up")
-        assert said("taken up: topics, nodes, capture, readers; ") and said("from the next start on: server\n")
+        assert said("taken up: topics, nodes, trigger, capture, readers; ") and said("from the next start on: server\n")
         assert arm.stdout is not None and arm.stdout.readline() == "done\n"
         (robot.readers / "owner.pem").unlink()
         process.send_signal(signal.SIGHUP)

@@ -135,14 +135,15 @@ def test_a_log_of_all_there_is(chain, verifier, tmp_path):
     pen = chain.pen
     first = pen.write(STREAM_LINE, message(1), message(2, text="é漢\u2028\x9b31m"), b"null", b"no json")
     chain.write(first, *pen.chunks(3, records=120))
+    event = line({"trigger": "crash", "why": "/bumper data == true", "at_ns": 10**18})
     lost = line({"lost": 3, "topic": "/scan", "why": "too long"})
     dropped = pen.drop(pen.write(message(7), message(8)))
-    chain.write(dropped, pen.write(lost, message(9)), pen.write())
+    chain.write(dropped, pen.write(lost, event, message(9)), pen.write())
     pen.new_stream(b"b" * 16)
     chain.write(*pen.chunks(2), pen.write(goodbye=True))
     read = both(chain, verifier, tmp_path)
     assert not read.here.sound
-    assert read.there["counts"] == {"unopenable": 2, "dropped": 2, "lost": 3, "restarted": 1}
+    assert read.there["counts"] == {"unopenable": 2, "dropped": 2, "lost": 3, "triggered": 1, "restarted": 1}
     assert len(read.records) == 2 + 360 + 1 + 2
     assert read.there["head"]["goodbye"]
 

@@ -613,6 +613,14 @@ def test_restarts_without_goodbye_are_counted(knows):
     assert ("knows of nothing before" in result.verdict.findings[0].detail) == (not knows)
 
 
+def test_why_and_when_records_were_written_late_is_told():
+    pen, event = Pen(), {"trigger": "crash\x1b[2J", "why": "/bumper data == true", "at_ns": 1_700_000_000_500_000_000}
+    result = read([pen.write(message(1)), pen.write(line(event), message(2))])
+    assert result.verdict.sound and result.found == [("triggered", 1, 1, 1)]
+    [finding] = result.verdict.findings
+    assert finding.detail.endswith(": /bumper data == true, 2023-11-14T22:13:20.500Z") and "\x1b" not in finding.detail
+
+
 def test_a_robot_that_lost_its_spool_after_a_goodbye():
     pen = Pen()
     chunks = pen.chunks(2, goodbye=True)
@@ -693,9 +701,9 @@ def test_findings_are_counted_beyond_those_that_are_kept():
     lines = [line({"lost": 1, "topic": f"/t{n}", "why": "x" * 1000}) for n in range(900)]
     verdict = read([pen.write(*lines)]).verdict
     assert verdict.counts["lost"] == 900
-    assert len(verdict.findings) == 500
+    assert len(verdict.findings) == 250
     assert sum(map(len, verdict.lines())) < 200_000
-    assert any("only the first 500 findings" in text for text in verdict.lines())
+    assert any("only the first 250 findings" in text for text in verdict.lines())
 
 
 def test_definitions_are_bounded():
