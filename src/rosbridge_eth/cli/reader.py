@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
 from rosbridge_eth.config import load_reader_config
-from rosbridge_eth.config.values import parse_time
-from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
+from rosbridge_eth.config.values import Address, parse_address, parse_time
+from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
 
 if TYPE_CHECKING:
-    from rosbridge_eth.reading import Reading
+    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl")(read)
+    app.command(
+        epilog="Examples: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl;"
+        " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
+    )(read)
     app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
 
 
@@ -47,8 +55,15 @@ def _time(text: str | None) -> int | None:
         raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
 
 
+def _address(text: str | None) -> Address | None:
+    try:
+        return None if text is None else parse_address(text if ":" in text else f"127.0.0.1:{text}")
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r}: write a port, or HOST:PORT", param_hint="--serve") from error
+
+
 def read(
-    robot: RobotName,
+    robot: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="The robot's name; several with --serve.")],
     home: ReaderHomeOption = READER_HOME,
     topic: Annotated[str | None, typer.Option(help="Only this topic.")] = None,
     from_: Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")] = None,
@@ -60,6 +75,10 @@ def read(
     field: Annotated[
         list[str] | None, typer.Option(help="Draw this field over time instead, such as pose.pose.position.x.")
     ] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Go on as blocks come, until Ctrl-C.")] = False,
+    serve: Annotated[
+        str | None, typer.Option(metavar="[HOST:]PORT", help="With --follow: show it on a page, on this machine.")
+    ] = None,
     node: Nodes = None,
     confirmations: Confirmations = 1,
     confirm: Confirm = False,
@@ -70,7 +89,7 @@ def read(
 
     What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
-    sealed for others.
+    sealed for others. With --follow, .mcap and .csv files grow; others are there at the end.
     """
     from rosbridge_eth.reading import Choice, outputs
     from rosbridge_eth.reading.verdict import shown
@@ -82,38 +101,67 @@ def read(
         raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
+    address = _address(serve)
+    if address is not None and not follow:
+        raise typer.BadParameter("a page shows what comes: give --follow, too", param_hint="--serve")
+    if follow and choice.at_ns is not None:
+        raise typer.BadParameter("a moment does not go on: leave one of the two", param_hint="--follow")
+    if follow and bag is not None and bag.suffix != ".mcap":
+        raise typer.BadParameter(f"only an .mcap file can be read while it grows, not {bag}", param_hint="--bag")
+    if len(robot) > 1 and (address is None or bag or table or plot):
+        raise typer.BadParameter("a file has one robot's records; several are for --serve", param_hint="ROBOT...")
     place = ReaderHome(home).require()
     for path, check in ((bag, outputs.check_bag), (table, outputs.check_table), (plot, outputs.check_picture)):
         if path is not None:
             check(path)
     picture = outputs.Curves(field) if field else outputs.Trajectory()
-    chosen = 0
-    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said), ExitStack() as files:
-        made = None if bag is None else files.enter_context(outputs.bag(bag))
-        sinks: list[Any] = [] if made is None else [made.write]
+    chosen = dict.fromkeys(robot, 0)
+    with ExitStack() as stack:
+        files = ExitStack()  # which is left first: what it holds is whole before the verdict is said
+        turns: list[Callable[[], object]] = [sys.stdout.flush]
+        records: Iterator[tuple[str, ProvenRecord]]
+        if follow:
+            records, said = stack.enter_context(
+                _following(place, robot, node, confirmations, confirm, passphrase_file, choice, address, turns)
+            )
+        else:
+            [name] = robot
+            reading, of_it = stack.enter_context(
+                _reading(place, name, node, confirmations, confirm, passphrase_file)
+            )
+            records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
+        stack.enter_context(files)
+        made = None if bag is None else files.enter_context(outputs.bag(bag, grows=follow))
+        sinks: list[Callable[[ProvenRecord], object]] = [] if made is None else [made.write]
+        if made is not None and follow:
+            turns.append(made.flush)
         if table is not None:
-            sinks.append(files.enter_context(outputs.table(table)).write)
+            rows = files.enter_context(outputs.table(table, grows=follow))
+            sinks.append(rows.write)
+            turns.append(rows.flush)
         if plot is not None:
             sinks.append(picture.write)
-        if not sinks and not json:
+        if not sinks and not json and address is None:
             sinks.append(lambda record: print(outputs.json_line(record), end=""))
-        for record in reading.records(choice):
-            chosen += 1
+        for name, record in records:
+            chosen[name] += 1
             for sink in sinks:
                 sink(record)
-        said |= {"chosen": chosen}
-    if json:
-        print_json(said)
+    for name, of_it in said.items():
+        of_it["chosen"] = chosen[name]
+        if json:
+            print_json(of_it)
     if made is not None:
         of = made.summary
         talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
-    if topic is not None and chosen == 0 and topic not in reading.topics:
+    if topic is not None and not follow and not chosen[name] and topic not in reading.topics:
         there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
         talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
-    _require_sound(place, robot, said)
+    for name, of_it in said.items():
+        _require_sound(place, name, of_it)
     if plot is not None and not picture.draw(plot):
         what = "a number there" if field else "a position"
-        raise ConfigError(f"{plot} shows nothing: none of the {chosen} chosen records holds {what}")
+        raise ConfigError(f"{plot} shows nothing: none of the {sum(chosen.values())} chosen records holds {what}")
 
 
 def compare(
@@ -156,10 +204,10 @@ def compare(
 
 
 @contextmanager
-def _reading(
-    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int, confirm: bool, file: Path | None
-) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
+def _asking(
+    place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
+) -> Iterator[tuple[Sequence[Ledger], Bookmarks, Callable[..., Reading]]]:
+    """The nodes, the bookmarks, and `read_robot` that wants to know only whose log, when, and behind what."""
     from rosbridge_eth.identity import Trust, load_identity
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading import Bookmarks, read_robot
@@ -167,14 +215,24 @@ def _reading(
     config = load_reader_config(place.config)
     identity, roots = load_identity(config.identity, read_passphrase("reader", "Passphrase of the reader", file=file))
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
-    bookmarks, said = Bookmarks(place.path / "bookmarks.json"), dict[str, Any]()
+    bookmarks = Bookmarks(place.path / "bookmarks.json")
     with ExitStack() as stack:
         for ledger in ledgers:
             stack.callback(ledger.close)
-        reading = read_robot(
-            ledgers, robot, trust=Trust(roots), reader=identity.encryption_key, now=time.time(), bookmarks=bookmarks,
+        yield ledgers, bookmarks, partial(
+            read_robot, ledgers, trust=Trust(roots), reader=identity.encryption_key, bookmarks=bookmarks,
             cache=place.path / "proven", confirmations=confirmations,
         )  # fmt: skip
+
+
+@contextmanager
+def _reading(
+    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int, confirm: bool, file: Path | None
+) -> Iterator[tuple[Reading, dict[str, Any]]]:
+    """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
+    said = dict[str, Any]()
+    with _asking(place, nodes, confirmations, file) as (_, bookmarks, read), ExitStack() as stack:
+        reading = read(robot, now=time.time())
         stack.callback(reading.close)
         yield reading, said
         verdict = reading.verdict()
@@ -182,6 +240,57 @@ def _reading(
     said |= verdict.as_json()
     for line in verdict.lines():
         talk(line)
+
+
+@contextmanager
+def _following(
+    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, confirmations: int, confirm: bool,
+    file: Path | None, choice: Choice, address: Address | None, turns: Sequence[Callable[[], object]],
+) -> Iterator[tuple[Iterator[tuple[str, ProvenRecord]], dict[str, dict[str, Any]]]]:  # fmt: skip
+    """Records as they are proven, until SIGINT or SIGTERM; and where the verdicts are when that has ended.
+
+    turns: called whenever all was given that there is.
+    """
+    from rosbridge_eth.reading.follow import EVERY, Followed, Following
+    from rosbridge_eth.reading.live import Page, View
+
+    said, stop = dict[str, dict[str, Any]](), threading.Event()
+    with _asking(place, nodes, confirmations, file) as (ledgers, bookmarks, read), ExitStack() as stack:
+        following = Following([Followed(name, read, bookmarks, confirm=confirm) for name in robots], ledgers)
+        view = View([ledger.url for ledger in ledgers], confirmations, robots)
+        if address is not None:
+            page = Page(address, view)
+            stack.callback(page.close)
+            talk(f"The page is http://{page.address}/; Ctrl-C ends it.")
+
+        def end(number: int, frame: object) -> None:
+            stop.set()
+            signal.signal(number, signal.default_int_handler)  # the second one does not wait
+
+        def records() -> Iterator[tuple[str, ProvenRecord]]:
+            while not stop.is_set():
+                for name, record in following.new(choice):
+                    view.write(name, record)
+                    yield name, record
+                    if stop.is_set():
+                        return
+                for turn in turns:
+                    turn()
+                view.show(following.robots)
+                for line in following.news():
+                    talk(line)
+                stop.wait(EVERY)
+
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            stack.callback(signal.signal, number, signal.signal(number, end))
+        yield records(), said
+    for robot in following.robots:
+        if robot.reading is None:  # as with a `read` that is interrupted
+            raise ChainError(f"{robot.name}: {robot.trouble}") if robot.trouble else KeyboardInterrupt
+        verdict = robot.reading.verdict()
+        said[robot.name] = verdict.as_json()
+        for line in verdict.lines():
+            talk(line)
 
 
 def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:

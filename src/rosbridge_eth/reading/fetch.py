@@ -11,7 +11,7 @@ from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
 from rosbridge_eth.reading.cache import Cache, add_topics, open_cache
-from rosbridge_eth.reading.verdict import Bookmarks, Verdict, shown
+from rosbridge_eth.reading.verdict import Bookmarks, Links, Progress, Verdict, shown
 from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Bodies, Choice, ProvenChunk, ProvenRecord, Verifier
 from smcrypto import sm2
 
@@ -26,24 +26,28 @@ MARGIN = 128
 class Reading:
     """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
 
-    kept: of earlier readings; `chunks` are those behind it. topics: that were read so far.
+    top: the block up to which is read. kept: of earlier readings; `chunks` are those behind it. topics: that were read
+    so far.
     """
 
     verifier: Verifier
     chunks: Iterator[ProvenChunk]
     nodes: Sequence[str]
+    top: Block
     kept: Cache | None = None
     topics: set[str] = field(default_factory=set)
 
-    def records(self, choice: Choice = EVERYTHING) -> Iterator[ProvenRecord]:
-        return choice.choose(self._records(choice))
+    def records(self, choice: Choice = EVERYTHING, first: int = 0) -> Iterator[ProvenRecord]:
+        """Those that are chosen, from the chunk of index `first` on."""
+        return choice.choose(self._records(choice, first))
 
-    def _records(self, choice: Choice) -> Iterator[ProvenRecord]:
-        if self.kept is not None:
-            yield from self.kept.records(choice, self.topics)
+    def _records(self, choice: Choice, first: int) -> Iterator[ProvenRecord]:
+        if self.kept is not None and self.kept.progress.count > first:
+            yield from (one for one in self.kept.records(choice, self.topics) if one.place.chunk >= first)
         for chunk in self.chunks:
-            add_topics(self.topics, (record.content.topic for record in chunk.records))
-            yield from chunk.records
+            if chunk.place.chunk >= first:
+                add_topics(self.topics, (record.content.topic for record in chunk.records))
+                yield from chunk.records
 
     def verdict(self) -> Verdict:
         return self.verifier.verdict(self.nodes)
@@ -57,24 +61,26 @@ class Reading:
         bookmark, known = self.verifier.bookmark(confirm=confirm), bookmarks.get(self.verifier.log)
         if bookmark is not None and known is not None and known.count > bookmark.count:
             bookmark = replace(known, fingerprints=bookmark.fingerprints)
-        if bookmark is not None:
+        if bookmark is not None and bookmark != known:
             bookmarks.put(self.verifier.log, bookmark)
 
 
 def read_robot(
     ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
     bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
-    heartbeat: float = HEARTBEAT, bodies: Bodies | None = None,
+    heartbeat: float = HEARTBEAT, bodies: Bodies | None = None, before: Reading | None = None,
 ) -> Reading:  # fmt: skip
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
     ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next
-    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted.
-    bodies: of archived chunks, see Verifier. Raises ChainError; ConfigError for nodes of different ledgers; IdentityError for a name that
-    the contract does not know.
+    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted. bodies: of
+    archived chunks, see Verifier. before: a reading that came to its end; this one goes on behind it if the chain is
+    the same up to there, and keeps nothing. Raises ChainError; ConfigError for nodes of different ledgers;
+    IdentityError for a name that the contract does not know.
     """
     tk = robot_id(check_name(name))
-    ledger, block, standing, told = _best(ledgers, tk, confirmations)
+    ledger, top, standing, told = _best(ledgers, tk, confirmations)
+    block = top.number
     if standing.account is None:
         raise IdentityError(
             f"no robot of the name {name} is registered in the contract {ledger.contract}; the operator's `status`"
@@ -85,23 +91,30 @@ def read_robot(
     if mark is not None and confirmations > 1 and standing.chunks < mark.count <= ledger.standings([tk])[0].chunks:
         mark = replace(mark, count=0)  # it is above the block that is asked for, and not taken back
     registrations = ledger.registrations(tk, standing)
-    kept = None if cache is None or reader is None else _kept(
-        cache, f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}", log, reader, trust, ledger,
-        block, told,
-    )  # fmt: skip
+    at, links, next_block, kept = Progress(), Links(), 0, None
+    if before is not None and before.verifier.honest and _still_there(ledger, before.top, block):
+        at, links, next_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
+    elif cache is not None and reader is not None:
+        file = f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}"
+        kept = _kept(cache, file, log, reader, trust, ledger, block, told)
+        if kept is not None:
+            at, links, next_block = kept.progress, kept.links, kept.next_block
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=mark,
-        at=None if kept is None else kept.progress, links=None if kept is None else kept.links, heartbeat=heartbeat,
+        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, heartbeat=heartbeat,
         elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), bodies=bodies,
     )  # fmt: skip
-    first_block = max(registrations[0].block if registrations else 0, kept.next_block if kept else 0)
+    first_block = max(registrations[0].block if registrations else 0, next_block)
     events = ledger.data_events(tk, first_block, standing.data_block)
     if kept is None:
         chunks = verifier.read(events)
     else:
         chunks = _keeping(kept, verifier, events, ledger.block(max(0, block - MARGIN)))
-    return Reading(verifier, _settled(ledger, block, chunks), told, kept)
+    return Reading(verifier, _settled(ledger, top, chunks), told, top, kept)
+
+
+def _still_there(ledger: Ledger, seen: Block, block: int) -> bool:
+    return seen.number <= block and ledger.block(seen.number).hash == seen.hash
 
 
 def _kept(
@@ -145,25 +158,24 @@ def _keeping(kept: Cache, verifier: Verifier, events: Iterator[DataEvent], final
         yield chunk
 
 
-def _settled(ledger: Ledger, block: int, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
+def _settled(ledger: Ledger, top: Block, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
     """The chunks; then ChainError if the chain was reorganised meanwhile: what is not there may have moved."""
-    before = ledger.block(block).hash
     yield from chunks
-    if ledger.block(block).hash != before:
+    if ledger.block(top.number).hash != top.hash:
         raise ChainError(
             f"the chain of {shown(ledger.url)} was reorganised while it was read; read again, with more confirmations"
         )
 
 
-def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, int, Standing, list[str]]:
+def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, Block, Standing, list[str]]:
     """The node with the highest count, the block up to which it is read, and what the others say otherwise."""
-    answers: list[tuple[Ledger, int, Standing]] = []
+    answers: list[tuple[Ledger, Block, Standing]] = []
     told: list[str] = []
     for ledger in ledgers:
         try:
-            block = max(0, ledger.block_number() - confirmations + 1)
-            [standing] = ledger.standings([tk], block)
-            answers.append((ledger, block, standing))
+            top = ledger.block(max(0, ledger.block_number() - confirmations + 1))
+            [standing] = ledger.standings([tk], top.number)
+            answers.append((ledger, top, standing))
             if ledger.ledger != answers[0][0].ledger:
                 raise ConfigError(f"{answers[0][0].url} and {ledger.url} are not of one chain and contract")
         except ChainError as error:
@@ -173,9 +185,9 @@ def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Led
     if not answers:
         raise ChainError("none of the nodes answers: " + "; ".join(told))
     best = max(answers, key=lambda answer: answer[2].chunks)
-    for ledger, block, standing in answers:
+    for ledger, top, standing in answers:
         if standing.chunks != best[2].chunks:
-            told.append(f"node {shown(ledger.url)} shows {standing.chunks:,} chunks only, in block {block}")
+            told.append(f"node {shown(ledger.url)} shows {standing.chunks:,} chunks only, in block {top.number}")
         elif standing.tail != best[2].tail:
-            told.append(f"node {shown(ledger.url)} has another last chunk, in block {block}: the nodes contradict")
+            told.append(f"node {shown(ledger.url)} has another last chunk, in block {top.number}: the nodes contradict")
     return *best, told

@@ -1,7 +1,9 @@
 """What a reader makes of proven records: JSON lines, a table, a bag that ROS tools open, a picture.
 
 Each output takes records one by one, so that one pass over a log fills them all, and stands under its name only when
-it is whole. A bag says no more than what was recorded:
+it is whole; or it grows there (.mcap, .csv), and others can read what there is after every `flush`.
+
+A bag says no more than what was recorded:
 
     on topic          type             what
     TOPIC             the original     records of which every field was captured
@@ -17,10 +19,12 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
+import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
@@ -50,6 +54,8 @@ _BATCH: Final = 4_096  # rows of a Parquet file that are made at once
 _FARTHEST: Final = 1e12
 """Metres from the origin; a position beyond is no position."""
 _STRING: Final = "std_msgs/msg/String"
+_MCAP_END: Final = struct.pack("<BQI BQQQI", 0x0F, 4, 0, 0x02, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
+"""Data End without a checksum, Footer without a summary, magic (mcap.dev/spec)."""
 _LAST_TIME: Final = {Wire.ROS1: 2**32 * 10**9 - 1, Wire.CDR: 2**63 - 1}
 _BAGS: Final = "NAME.bag (ROS 1), NAME.mcap or NAME.db3 (ROS 2, one file), or NAME (ROS 2, a folder)"
 _PICTURES: Final = "name it .png, .svg or .pdf"
@@ -118,10 +124,14 @@ _FIXED: Final = {
 
 
 class Table:
-    """Rows are kept in a file until all columns, and what kinds of values they have, are known."""
+    """Rows are kept in a file until all columns, and what kinds of values they have, are known.
 
-    def __init__(self, rows: Any) -> None:
-        self._rows = rows
+    grows: the CSV file to which `flush` brings the rows; it is written anew where they brought another column.
+    """
+
+    def __init__(self, rows: Any, grows: Path | None = None) -> None:
+        self._rows, self._grows = rows, grows
+        self._flushed, self._header = 0, -1  # how far the rows are there, under so many columns
         self._columns: dict[str, set[str]] = {}
         self._times: dict[TypeLine | None, frozenset[str]] = {None: frozenset()}
 
@@ -129,7 +139,7 @@ class Table:
         content, place = record.content, record.place
         if record.definition not in self._times:
             self._times[record.definition] = _time_fields(record.definition)
-        times, cells = self._times[record.definition], dict(_cells(content.data, ""))
+        times, cells = self._times[record.definition], dict(flattened(content.data, ""))
         for column, value in cells.items():
             if column in self._columns or len(self._columns) < MAX_COLUMNS:
                 kind = _kind(value)
@@ -141,17 +151,25 @@ class Table:
         ]  # fmt: skip
         self._rows.write(json.dumps(row) + "\n")
 
-    def _read(self) -> Iterator[list[Any]]:
-        self._rows.seek(0)
+    def _read(self, start: int = 0) -> Iterator[list[Any]]:
+        self._rows.seek(start)
         for row in self._rows:
             *fixed, cells = json.loads(row)
             yield [*fixed, *(cells.get(column) for column in self._columns)]
 
+    def flush(self) -> None:
+        if self._grows is not None:
+            self.write_csv(self._grows)
+
     def write_csv(self, path: Path) -> None:
-        with path.open("w", newline="", encoding="utf-8") as file:
+        """What is not there yet."""
+        anew = len(self._columns) != self._header
+        with path.open("w" if anew else "a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow([_cell(column) for column in (*_FIXED, *self._columns)])
-            writer.writerows(map(_cell, row) for row in self._read())
+            if anew:
+                writer.writerow([_cell(column) for column in (*_FIXED, *self._columns)])
+            writer.writerows(map(_cell, row) for row in self._read(0 if anew else self._flushed))
+        self._flushed, self._header = self._rows.seek(0, 2), len(self._columns)
 
     def write_parquet(self, path: Path) -> None:
         pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
@@ -168,10 +186,10 @@ class Table:
                 writer.write_batch(pyarrow.record_batch(columns, schema=schema))
 
 
-def _cells(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
     for name, value in data.items():
         if isinstance(value, dict):
-            yield from _cells(value, f"{path}{name}.")
+            yield from flattened(value, f"{path}{name}.")
         else:
             yield path + name, value
 
@@ -234,11 +252,17 @@ def _cell(value: Any) -> Any:
 
 
 @contextmanager
-def table(path: Path) -> Iterator[Table]:
-    """A row each record, a column each field that is no message; arrays as JSON in one cell, in Parquet as lists."""
+def table(path: Path, *, grows: bool = False) -> Iterator[Table]:
+    """A row each record, a column each field that is no message; arrays as JSON in one cell, in Parquet as lists.
+
+    grows: a .csv file is there from the beginning; one of Parquet has its columns' types when all of it is known.
+    """
     check_table(path)
-    with _whole(path) as within, tempfile.TemporaryFile("w+", dir=within.parent) as rows:
-        made = Table(rows)
+    grows = grows and path.suffix == ".csv"
+    where = nullcontext(path) if grows else _whole(path)
+    with where as within, tempfile.TemporaryFile("w+", dir=within.parent) as rows:
+        made = Table(rows, path if grows else None)
+        made.flush()
         yield made
         (made.write_csv if path.suffix == ".csv" else made.write_parquet)(within)
 
@@ -268,8 +292,11 @@ class BagSummary:
 
 
 @contextmanager
-def bag(path: Path) -> Iterator[Bag]:
-    """A bag of the kind that `check_bag` finds the name to say. Messages bear the time at which they were received."""
+def bag(path: Path, *, grows: bool = False) -> Iterator[Bag]:
+    """A bag of the kind that `check_bag` finds the name to say. Messages bear the time at which they were received.
+
+    grows: the file is there from the beginning; of bags, only an .mcap file can be read while it is written.
+    """
     from rosbags import rosbag1, rosbag2
 
     wire = check_bag(path)
@@ -285,6 +312,8 @@ def bag(path: Path) -> Iterator[Bag]:
         folder = within.with_name("bag") if path.suffix else within
         with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as two:
             made = Bag(two, wire)
+            if grows:
+                os.link(made.file, path)
             yield made
             made.write_notes()
         if path.suffix:
@@ -303,6 +332,21 @@ class Bag:
         self._last = 0
         self._string = self._restoration(_STRING, None)
         self.summary = BagSummary()
+
+    @property
+    def file(self) -> Path:
+        """Of a ROS 2 bag, the file that holds all of it."""
+        return Path(self._writer.storage.path)
+
+    def flush(self) -> None:
+        """Bring an MCAP file to an end, as one without a summary; what follows is written over that end."""
+        storage = self._writer.storage
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        at = storage.bio.tell()
+        storage.bio.write(_MCAP_END)
+        storage.bio.flush()
+        storage.bio.seek(at)
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
@@ -379,10 +423,10 @@ _Point = TypeVar("_Point", bound=tuple[float, ...])
 
 
 class _Points(Generic[_Point]):
-    """Any number of points as at most MAX_POINTS: neighbours become one by `merge`, all over the length alike."""
+    """Any number of points as `most` of them: neighbours become one by `merge`, all over the length alike."""
 
-    def __init__(self, merge: Callable[[_Point, _Point], _Point]) -> None:
-        self._merge, self._each = merge, 1
+    def __init__(self, merge: Callable[[_Point, _Point], _Point], most: int = MAX_POINTS) -> None:
+        self._merge, self._most, self._each = merge, most, 1
         self.count, self.kept = 0, list[_Point]()
 
     def add(self, point: _Point) -> None:
@@ -390,7 +434,7 @@ class _Points(Generic[_Point]):
         if self.count % self._each:
             self.kept[-1] = self._merge(self.kept[-1], point)
         else:
-            if len(self.kept) == MAX_POINTS:
+            if len(self.kept) == self._most:
                 self.kept = list(map(self._merge, self.kept[::2], self.kept[1::2]))
                 self._each *= 2
             self.kept.append(point)
@@ -400,14 +444,15 @@ class _Points(Generic[_Point]):
 class Trajectory:
     """Where the robot was, as seen from above. tracks: of each topic that has positions, (received_ns, x, y)."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = MAX_POINTS) -> None:
+        self._most = most
         self.tracks: dict[str, _Points[tuple[float, float, float]]] = {}
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
         point = _position(content.data)
         if point is not None and (content.topic in self.tracks or len(self.tracks) < MAX_TRACKS):
-            track = self.tracks.setdefault(content.topic, _Points(lambda kept, _: kept))
+            track = self.tracks.setdefault(content.topic, _Points(lambda kept, _: kept, self._most))
             track.add((content.received_ns, *point))
 
     def draw(self, path: Path) -> int:

@@ -175,27 +175,31 @@ class Bookmarks:
     """A JSON file beside the reader's key: of each ledger and robot, the bookmark."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._file = path, _File()
+        self._path = path
+        self._logs()
+
+    def _logs(self) -> dict[str, Bookmark]:
+        """As they are now: another command may have moved one."""
         try:
-            self._file = _File.model_validate_json(path.read_bytes())
+            return _File.model_validate_json(self._path.read_bytes()).logs
         except FileNotFoundError:
-            pass
+            return {}
         except (ValueError, OSError) as error:
             raise ConfigError(
-                f"the bookmarks in {path} cannot be used ({shown(str(error))}); bring the file back from a copy:"
+                f"the bookmarks in {self._path} cannot be used ({shown(str(error))}); bring the file back from a copy:"
                 " without it a reading cannot know whether the log is the one that was read before"
             ) from error
 
     def get(self, log: Log) -> Bookmark | None:
-        return self._file.logs.get(_key(log))
+        return self._logs().get(_key(log))
 
     def put(self, log: Log, bookmark: Bookmark) -> None:
-        self._file.logs[_key(log)] = bookmark
-        write_atomically(self._path, self._file.model_dump_json(indent=1).encode() + b"\n")
+        file = _File(logs=self._logs() | {_key(log): bookmark})
+        write_atomically(self._path, file.model_dump_json(indent=1).encode() + b"\n")
 
     def other_ledgers(self, log: Log) -> list[bytes]:
         """Ids of the other ledgers on which this reader has read the same robot."""
-        return [bytes.fromhex(key[:64]) for key in self._file.logs if key[65:] == log.tk.hex() and key != _key(log)]
+        return [bytes.fromhex(key[:64]) for key in self._logs() if key[65:] == log.tk.hex() and key != _key(log)]
 
 
 def _key(log: Log) -> str:

@@ -139,12 +139,13 @@ class Verifier:
         heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None,
     ) -> None:  # fmt: skip
         self.name, self.log = name, Log(ledger, robot_id(name))
-        self._bodies, self._bodies_withheld = bodies, 0
+        self._bodies = bodies
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
         self._at, self.links = deepcopy(at or Progress()), links or Links()
         self.findings = Findings(self._at.found, self._at.findings)
+        self._bodies_withheld = self.findings.counts[Kind.WITHHELD.label]  # by an archive: a reading goes on behind an honest one
         self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
         self._last = b""  # the newest chunk, as it came
         self._marked = mark is None or mark.count <= self._at.count  # whether the mark's chunk was compared
@@ -390,10 +391,14 @@ class Verifier:
         )  # fmt: skip
 
     @property
+    def shown_all(self) -> bool:
+        """Whether the node kept nothing back so far."""
+        return self.findings.counts[Kind.WITHHELD.label] == self._bodies_withheld
+
+    @property
     def honest(self) -> bool:
         """Whether the node kept nothing back, and showed again what it showed before."""
-        counts = self.findings.counts
-        return counts[Kind.WITHHELD.label] == self._bodies_withheld and not counts[Kind.ROLLED_BACK.label]
+        return self.shown_all and not self.findings.counts[Kind.ROLLED_BACK.label]
 
     @property
     def keeps(self) -> bool:

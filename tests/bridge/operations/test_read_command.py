@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+from collections.abc import Callable
+from urllib.request import urlopen
 
 import pytest
+from rosbags.highlevel import AnyReader
 
 from bridge.operations.conftest import Place
 from bridge.operations.test_exit_codes import CHECK, READER, STREAM_LINE, replayed, written
 from rosbridge_eth.cli import run
+from rosbridge_eth.errors import ChainError
 from rosbridge_eth.identity import load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.reading import follow
 from rosbridge_eth.reading.fetch import MARGIN
 
 READ = ("read", "robot_1", *READER)
@@ -83,3 +90,92 @@ def test_topics_are_escaped_where_nothing_was_read(place: Place, keys: Keyring, 
     said = capsys.readouterr().err
     assert "nothing was read on" in said
     assert all(text.isprintable() for text in said.splitlines())
+
+
+def steps(monkeypatch: pytest.MonkeyPatch, *each: Callable[[], object]) -> None:
+    """Between the looks of a `read --follow`, one after the other; the last one ends it."""
+    left = [*each]
+    news = follow.Following.news
+
+    def step(self: follow.Following) -> list[str]:
+        said = list(news(self))
+        left.pop(0)()
+        return said
+
+    monkeypatch.setattr(follow, "EVERY", 0.0)
+    monkeypatch.setattr(follow.Following, "news", step)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_read_goes_on_as_blocks_come_and_ends_in_order(
+    place: Place, keys: Keyring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, number: int
+):
+    def grown() -> None:
+        with AnyReader([place.path / "g.mcap"]) as bag:
+            assert bag.message_count == 300
+        assert (place.path / "g.csv").read_text().count("\n") == 301
+
+    steps(monkeypatch, lambda: replayed(place, keys), grown, lambda: os.kill(os.getpid(), number))
+    before = signal.getsignal(number)
+    assert run([*READ, "--follow", "--bag", "g.mcap", "--table", "g.csv", "--plot", "g.png", "--json"]) == 0
+    said = capsys.readouterr()
+    verdict = json.loads(said.out)
+    assert (verdict["sound"], verdict["records"], verdict["chosen"], verdict["chunks"]) == (True, 300, 300, 1)
+    assert "robot_1: sound, 0 chunks, read up to block" in said.err and "300 records proven" in said.err
+    assert "g.mcap: 300 whole messages" in said.err and (place.path / "g.png").stat().st_size > 5_000
+    assert signal.getsignal(number) is before
+    bookmarks = json.loads((place.path / "reader" / "bookmarks.json").read_text())
+    assert [mark["count"] for mark in bookmarks["logs"].values()] == [1]
+
+
+def test_json_lines_come_as_blocks_come_and_an_unsound_log_ends_with_9(
+    place: Place, keys: Keyring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    replayed(place, keys)
+    steps(monkeypatch, lambda: replayed(place, keys), lambda: None, lambda: os.kill(os.getpid(), signal.SIGINT))
+    assert run([*READ, "--follow"]) == 9
+    said = capsys.readouterr()
+    assert said.out.count('"proof":') == 600
+    assert "forked: chunk 1" in said.err and "see the findings above" in said.err
+
+
+def test_the_page_is_served_while_it_is_followed(
+    place: Place, keys: Keyring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    shown = list[bytes]()
+
+    def look() -> None:
+        said = capsys.readouterr().err
+        address = said.partition("The page is ")[2].partition(";")[0]
+        shown.append(urlopen(address).read())
+        with urlopen(address + "events") as events:
+            shown.extend(events.readline() for _ in range(3))
+
+    replayed(place, keys)
+    steps(monkeypatch, look, lambda: os.kill(os.getpid(), signal.SIGINT))
+    assert run([*READ, "--follow", "--serve", "0"]) == 0
+    assert b"<title>Robots" in shown[0]
+    [robot] = json.loads(shown[3].removeprefix(b"data: "))["robots"]
+    assert (robot["name"], robot["sound"], robot["tracks"][0]["count"]) == ("robot_1", True, 300)
+    assert capsys.readouterr().out == "", "with a page there are no JSON lines"
+
+
+@pytest.mark.parametrize("wrong", [
+    ["--serve", "0"], ["--follow", "--at", "2026-11-21T10:00:00Z"], ["--follow", "--bag", "g.bag"], ["robot_2"],
+    ["robot_2", "--follow"], ["robot_2", "--follow", "--serve", "0", "--bag", "g.mcap"],
+    ["--follow", "--serve", "x:y:1"], ["--follow", "--serve", "70000"],
+])  # fmt: skip
+def test_what_does_not_go_together_is_a_usage_error(place: Place, wrong: list[str]):
+    assert run([*READ, *wrong]) == 2
+
+
+def test_a_reading_that_never_came_to_its_end_is_interrupted(
+    place: Place, keys: Keyring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def away(*_: object) -> None:
+        raise ChainError("the node does not answer")
+
+    monkeypatch.setattr(Ledger, "block", away)
+    steps(monkeypatch, lambda: None, lambda: os.kill(os.getpid(), signal.SIGINT))
+    assert run([*READ, "--follow"]) == 7
+    assert capsys.readouterr().err.count("the node does not answer; it is asked again") == 1

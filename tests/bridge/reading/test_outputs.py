@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import struct
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy
 import pytest
 from matplotlib.image import imread
+from mcap.exceptions import EndOfFile, McapError
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -497,3 +503,83 @@ def test_without_pyarrow_parquet_is_refused_before_anything_is_read(tmp_path, mo
     monkeypatch.setattr(outputs, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pysmcrypto\[parquet\]"):
         outputs.check_table(tmp_path / "t.parquet")
+
+
+# --- files that grow
+
+
+def test_an_mcap_file_that_grows_is_whole_after_every_flush(tmp_path: Path):
+    """Read by the format's own reader, by its index where there is one and as a stream, and by rosbags."""
+    path, copy, own = tmp_path / "g.mcap", tmp_path / "copy.mcap", known("nav_msgs/msg/Odometry")
+    odometry = {"child_frame_id": "base"}
+    with outputs.bag(path, grows=True) as made:
+        for n in range(4):
+            made.write(point(n))
+            if n > 1:
+                made.write(record(n, "nav_msgs/msg/Odometry", odometry, topic="/odom", definition=own))
+            made.flush()
+            made.flush()
+            copy.write_bytes(path.read_bytes())
+            check_mcap(copy, ["/t"] * (n + 1) + ["/odom/partial"] * max(0, n - 1))
+    check_mcap(path, ["/t"] * 4 + ["/odom/partial"] * 2 + [outputs.NOTES])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert (summary.statistics.message_count, len(summary.chunk_indexes)) == (7, 5)
+    assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".")] == []
+
+
+def check_mcap(path: Path, topics: list[str]) -> None:
+    for reader in (make_reader, NonSeekingReader):
+        with path.open("rb") as file:
+            found = list(reader(file).iter_messages())
+            assert sorted(channel.topic for _, channel, _ in found) == sorted(topics)
+            for schema, channel, message in found:
+                assert (channel.message_encoding, schema.encoding) == ("cdr", "ros2msg")
+                assert message.data and (b"float64" in schema.data or b"string" in schema.data)
+    with path.open("rb") as file:
+        assert make_reader(file).get_header().profile == "ros2"
+    with AnyReader([path]) as bag:
+        assert bag.message_count == len(topics)
+
+
+def test_what_was_flushed_is_there_after_a_kill(tmp_path: Path):
+    """The file between two flushes, and cut within the second, as a stream is read."""
+    path, copy = tmp_path / "g.mcap", tmp_path / "copy.mcap"
+    with outputs.bag(path, grows=True) as made:
+        for n in range(3):
+            made.write(point(n))
+        made.flush()
+        before = len(path.read_bytes())
+        made.write(point(3))
+        copy.write_bytes(path.read_bytes())
+        check_mcap(copy, ["/t"] * 3)
+        made.flush()
+        for cut in (before, before + 10, len(path.read_bytes()) - 60):
+            copy.write_bytes(path.read_bytes()[:cut])
+            got = []
+            with copy.open("rb") as file, suppress(EndOfFile, McapError, struct.error):
+                for one in StreamReader(file).records:
+                    got += [one] if isinstance(one, Message) else []
+            assert len(got) in (3, 4)
+
+
+def test_a_csv_file_that_grows_is_at_every_flush_what_it_would_be_at_the_end(tmp_path: Path):
+    def rows(path: Path) -> list[dict[str, Any]]:
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    grows, given = tmp_path / "g.csv", list[ProvenRecord]()
+    with outputs.table(grows, grows=True) as made:
+        assert rows(grows) == []
+        for n in range(6):
+            given.append(record(n, "a/msg/A", {"x": n, **({"late": "=1"} if n > 3 else {})}))
+            made.write(given[-1])
+            if n != 2:
+                made.flush()
+                with outputs.table(tmp_path / f"{n}.csv") as whole:
+                    for one in given:
+                        whole.write(one)
+                assert rows(grows) == rows(tmp_path / f"{n}.csv")
+                assert len(rows(grows)) == n + 1
+    assert [row["late"] for row in rows(grows)] == ["", "", "", "", "'=1", "'=1"]

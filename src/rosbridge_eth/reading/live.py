@@ -1,0 +1,210 @@
+"""A page that shows robots as their log is proven: trajectories, latest values, and how the chain stands.
+
+The page asks for `events` (Server-Sent Events) and is sent all there is to show, at most once a second and only where
+it changed. A page that missed something has missed nothing, so neither end remembers what the other knows. It is
+served to whoever asks at a name of this machine's own: no site elsewhere that a browser shows can read it.
+
+Memory is bounded: so many points of a trajectory, the newest record of so many topics, the findings of the verdict.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import sys
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from itertools import islice
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from rosbridge_eth.config.values import Address, time_text
+from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.reading.follow import EVERY, Followed
+from rosbridge_eth.reading.outputs import Trajectory, flattened
+from rosbridge_eth.reading.verdict import printable, shown
+from rosbridge_eth.reading.verify import ProvenRecord
+
+MAX_POINTS: Final = 1 << 10
+"""Of a topic's trajectory; a longer one is thinned out all over its length."""
+MAX_TOPICS: Final = 64
+MAX_FIELDS: Final = 64
+MAX_PAGES: Final = 16
+"""Pages that are shown at once."""
+QUIET: Final = 15
+"""So many seconds without news, and a comment is sent: an end that is gone is noticed."""
+PATIENCE: Final = 10.0
+OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+_FILES: Final = {
+    "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"), "/live.js": ("live.js", "text/javascript"),
+}  # fmt: skip
+_HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}  # fmt: skip
+
+
+class View:
+    """What the page shows. Written by the thread that reads, `state` asked for by those that serve."""
+
+    def __init__(self, nodes: Sequence[str], confirmations: int, robots: Iterable[str]) -> None:
+        self._lock, self.version, self.closed = threading.Lock(), 0, threading.Event()
+        self._about = {"nodes": nodes, "confirmations": confirmations}
+        self._tracks = {name: Trajectory(MAX_POINTS) for name in robots}
+        self._latest: dict[str, dict[str, ProvenRecord]] = {name: {} for name in self._tracks}
+        self._stands: dict[str, dict[str, Any]] = {name: {} for name in self._tracks}
+
+    def write(self, name: str, record: ProvenRecord) -> None:
+        with self._lock:
+            self._tracks[name].write(record)
+            latest = self._latest[name]
+            if record.content.topic in latest or len(latest) < MAX_TOPICS:
+                latest[record.content.topic] = record
+            self.version += 1
+
+    def show(self, robots: Iterable[Followed]) -> None:
+        """How the robots' logs stand now."""
+        with self._lock:
+            for robot in robots:
+                self._stands[robot.name] = _standing(robot)
+            self.version += 1
+
+    def state(self) -> tuple[int, bytes]:
+        """The version and, as JSON, all of it."""
+        with self._lock:
+            robots = [
+                {"name": name, **self._stands[name], "tracks": _tracks(track),
+                 "latest": [_values(one) for _, one in sorted(self._latest[name].items())]}
+                for name, track in self._tracks.items()
+            ]  # fmt: skip
+            return self.version, json.dumps(self._about | {"robots": robots}, separators=(",", ":")).encode()
+
+
+def _standing(robot: Followed) -> dict[str, Any]:
+    if robot.reading is None:
+        return {"trouble": robot.trouble}
+    verdict, top = robot.reading.verdict(), robot.reading.top
+    head = verdict.head
+    return {
+        "trouble": robot.trouble, "sound": verdict.sound, "block": verdict.block, "block_s": top.time,
+        "chunks": verdict.chunks, "records": verdict.records, "goodbye": head is not None and head.goodbye,
+        "sealed_ms": head and head.sealed_ms, "silent_s": verdict.heartbeat, "lines": list(verdict.lines()),
+    }  # fmt: skip
+
+
+def _tracks(trajectory: Trajectory) -> list[dict[str, Any]]:
+    return [
+        {"topic": printable(topic), "count": track.count, "from_ns": str(track.kept[0][0]), "to_ns": str(track.last[0]),
+         "points": [[float(f"{x:.7g}"), float(f"{y:.7g}")] for _, x, y in (*track.kept, track.last)]}
+        for topic, track in trajectory.tracks.items()
+    ]  # fmt: skip
+
+
+def _values(record: ProvenRecord) -> dict[str, Any]:
+    content, place = record.content, record.place
+    cells = flattened(content.data, "")
+    fields = [[shown(name), shown(_text(value), 80)] for name, value in islice(cells, MAX_FIELDS)]
+    return {
+        "topic": printable(content.topic), "type": shown(content.type_name), "received": time_text(content.received_ns),
+        "chunk": place.chunk, "block": place.block, "fields": fields, "more": sum(1 for _ in cells),
+    }  # fmt: skip
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_text, value[:6]))}{f', … {len(value):,} in all' if len(value) > 6 else ''}]"
+    return f"{value:.6g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value)
+
+
+class Page:
+    """Serves a view from threads of its own until `close`. NetworkError where the address cannot be had."""
+
+    def __init__(self, address: Address, view: View) -> None:
+        files = resources.files(__package__)
+        handler = type("_View", (_Handler,), {
+            "view": view, "names": OWN_NAMES | {address.host}, "room": threading.BoundedSemaphore(MAX_PAGES),
+            "files": {path: (files.joinpath(name).read_bytes(), kind) for path, (name, kind) in _FILES.items()},
+        })  # fmt: skip
+        family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        server = type("_Server", (_Server,), {"address_family": family})
+        try:
+            self._http = server(tuple(address), handler)
+        except OSError as error:
+            raise NetworkError(f"the page cannot be served at {address}: {error.strerror}; choose another") from error
+        self.address, self._view = Address(address.host, self._http.server_address[1]), view
+        threading.Thread(target=self._http.serve_forever, args=(0.2,), name="page", daemon=True).start()
+
+    def close(self) -> None:
+        self._view.closed.set()
+        self._http.shutdown()
+        self._http.server_close()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exception(), OSError):  # a page that was closed
+            super().handle_error(request, client_address)
+
+
+def _host(header: str) -> str | None:
+    """The name in a Host header, without its port."""
+    try:
+        return urlsplit(f"//{header}").hostname
+    except ValueError:
+        return None
+
+
+class _Handler(BaseHTTPRequestHandler):
+    view: View
+    names: frozenset[str]
+    room: threading.BoundedSemaphore
+    files: Mapping[str, tuple[bytes, str]]
+    timeout, server_version, sys_version = PATIENCE, "rosbridge-eth", ""
+
+    def do_GET(self) -> None:
+        # A site that gave its own name this machine's address (DNS rebinding) comes with its own name here.
+        if _host(self.headers.get("Host", "")) not in self.names:
+            self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")
+        elif self.path == "/events":
+            self._send_events()
+        elif self.path in self.files:
+            self._send(HTTPStatus.OK, *self.files[self.path])
+        else:
+            self._send(HTTPStatus.NOT_FOUND, b"the page is /\n")
+
+    def _send(self, status: HTTPStatus, body: bytes, kind: str = "text/plain") -> None:
+        self.send_response(status)
+        for name, value in (_HEADERS | {"Content-Type": f"{kind}; charset=utf-8"}).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _send_events(self) -> None:
+        if not self.room.acquire(blocking=False):
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many pages are shown\n")
+            return
+        try:
+            self._send(HTTPStatus.OK, b"retry: 1000\n\n", "text/event-stream")
+            sent, quiet = -1, 0
+            while not self.view.closed.wait(EVERY if sent >= 0 else 0):
+                quiet += 1
+                if self.view.version != sent:
+                    (sent, state), quiet = self.view.state(), 0
+                    self.wfile.write(b"data: " + state + b"\n\n")
+                elif quiet >= QUIET:
+                    self.wfile.write(b":\n\n")
+                    quiet = 0
+        except OSError:
+            pass  # the page was closed
+        finally:
+            self.room.release()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: whoever looks on is no event of the reading."""
