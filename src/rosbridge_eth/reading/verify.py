@@ -145,7 +145,8 @@ class Verifier:
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
         self._at, self.links = deepcopy(at or Progress()), links or Links()
         self.findings = Findings(self._at.found, self._at.findings)
-        self._bodies_withheld = self.findings.counts[Kind.WITHHELD.label]  # by an archive: a reading goes on behind an honest one
+        # What a reading goes on behind was honest, so what was withheld there was so by an archive.
+        self._bodies_withheld = self.findings.counts[Kind.WITHHELD.label]
         self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
         self._last = b""  # the newest chunk, as it came
         self._marked = mark is None or mark.count <= self._at.count  # whether the mark's chunk was compared

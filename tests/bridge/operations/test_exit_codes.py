@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -86,6 +88,25 @@ def forged(place: Place, keys: Keyring) -> None:
     place.ledger.set_data(account, TK, [next(iter(chunk_chain(1))).encoded])
 
 
+def triggered(place: Place, keys: Keyring) -> None:
+    """A process that shows a trigger, as a robot does, and takes one event."""
+    program = """
+import sys, time
+from pathlib import Path
+from rosbridge_eth import metrics
+from rosbridge_eth.home import RobotHome
+place = RobotHome(Path("robot"))
+with metrics.shared(place.path):
+    metrics.FIRED.labels("robot_1", "crash").set(0)
+    print("up", flush=True)
+    while not place.event("crash").exists():
+        time.sleep(0.02)
+    place.event("crash").unlink()
+"""
+    running = subprocess.Popen([sys.executable, "-c", program], cwd=place.path, stdout=subprocess.PIPE)
+    assert running.stdout is not None and running.stdout.readline() == b"up\n"
+
+
 CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("done", REVOKE, as_it_is),
     ("the node is away", REVOKE, as_it_is),
@@ -98,6 +119,8 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("what is there is not what", ("read", "robot_1", *READER), forged),
     ("it is sound, and every record is sealed for others", ("read", "robot_1", *READER), written),
     ("no robot of that name is in the contract", ("read", "robot_9", *READER), as_it_is),
+    ("the running robot has taken it", ("trigger", "crash"), triggered),
+    ("no robot runs with that home", ("trigger", "crash"), as_it_is),
     ("every message of the bag is on the chain", COMPARE, replayed),
     ("one is missing", COMPARE, lambda place, keys: replayed(place, keys, without=7)),
     ("there is no such bag", ("compare", "none.bag", "robot_1", *READER), replayed),
