@@ -388,6 +388,8 @@ def captured(count: int) -> tuple[list[bytes], str, bytes]:
         if len(lines) == count:
             break
     bag.close()
+    if len(lines) < count:
+        raise SystemExit(f"the sample bag has {len(lines)} messages on {TOPIC}, not {count}")
     return lines, raw.type_name, definition_line(raw.decoder)
 
 

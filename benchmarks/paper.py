@@ -149,7 +149,7 @@ def interaction(kind: str, quick: bool, dag: Path | None) -> Part:
 
 def bridge(kind: str, quick: bool, dag: Path | None) -> Part:
     """Four robots from `init` to a proven read; by proof of work with a reorganisation in a second run."""
-    messages = 10 if quick else 400
+    messages = 10 if quick else 300
     network = chain_interaction.network("clique" if dag is None else "ethash", 0, 1, dag)
     with network as urls, tempfile.TemporaryDirectory() as folder:
         began = time.monotonic()
@@ -183,7 +183,7 @@ def reorganisation(dag: Path) -> Part:
         [robot] = operator.robots
         tk = load.robot_id(robot.name)
         session = load.Session(operator, robot, ("127.0.0.1", 9))
-        sealed = session.seal(400, 20)
+        sealed = session.seal(300, 20)
         chunks = [load.Chunk.parse(chunk) for chunk in sealed.values()]
         inbox = open_store(operator.config, operator.home)
         submitter = open_submitter(
