@@ -220,7 +220,12 @@ def test_up_says_what_it_lacks_and_goes_on_when_that_is_there(
     account = OperatorHome(Path("operator")).account
     fails(capsys, ExitCode.CHAIN, "npx", "up", *OPERATOR)
     assert OperatorHome(Path("operator")).account == account, "what is there is used"
-    fails(capsys, ExitCode.CONFIG, "another node", "up", "--chain", "http://127.0.0.1:9", *OPERATOR)
+    for option, value, key in (
+        ("--chain", "http://127.0.0.1:9", "[chain] url"), ("--listen", "127.0.0.1:9", "listen"),
+        ("--public", "192.0.2.1:9", "public"),
+    ):
+        fails(capsys, ExitCode.CONFIG, f"change {key} there", "up", option, value, *OPERATOR)
+    fails(capsys, ExitCode.CHAIN, "npx", "up", "--listen", "0.0.0.0:7410", *OPERATOR)
     fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "up", "--home", "other", "--reader", "others", "--chain",
           "http://127.0.0.1:9", *OPERATOR)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as jsonlib
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -92,7 +92,7 @@ def up(
     home: OperatorHomeOption = OPERATOR_HOME,
     reader: Annotated[Path, typer.Option(help="Folder for the first reader, `owner`.")] = READER_HOME,
     chain: Annotated[str | None, typer.Option(help="A node of yours; without it, an anvil kept in the home.")] = None,
-    listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
+    listen: Annotated[str | None, typer.Option(help="UDP address of the robots' door: 0.0.0.0:7410.")] = None,
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
     passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
@@ -111,18 +111,28 @@ def up(
         secret = read_passphrase("operator", "A passphrase for all of it", file=passphrase_file, confirm=True)
         keys = init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
-            listen=listen, public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
+            listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
             passphrase_file=passphrase_file,
         )
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
         place = OperatorHome(home)
     else:
         place, secret, keys = _opened(home, passphrase_file)
+        known = load_server_config(place.config)
+        for key, given, now in (
+            ("listen", listen, known.listen), ("public", public, known.public), ("[chain] url", chain, known.chain.url)
+        ):
+            if given not in (None, str(now)):
+                raise ConfigError(f"{place.config} has another address than the option: change {key} there")
     url, state = load_server_config(place.config).chain.url, home / "chain.json"
-    if chain not in (None, url):
-        raise ConfigError(f"{place.config} names another node; change [chain] url there")
     node, deployed = urlsplit(url), place.deployment_file.exists()
     port = node.port if chain is None and node.hostname == "127.0.0.1" and (state.exists() or not deployed) else None
+    anvil: Anvil | None = None
+
+    def look() -> None:
+        if anvil is not None and not anvil.running():
+            raise ChainError(f"the local chain ended by itself; what {state} has of it is kept: run `up` again")
+
     with ExitStack() as stack:
         if port is not None and is_free(port):
             anvil = stack.enter_context(Anvil.start(port, state=state))
@@ -135,7 +145,7 @@ def up(
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
-        _serve(place, secret, keys, {})
+        _serve(place, secret, keys, {}, look)
     talk("Everything is kept: `up` goes on with it.")
 
 
@@ -379,8 +389,11 @@ def server(
     _serve(*_opened(home, passphrase_file), {} if workers is None else {"workers": workers})
 
 
-def _serve(place: OperatorHome, passphrase: bytes, keys: Keyring, changes: dict[str, int]) -> None:
-    """Run the server, with these keys of server.toml changed."""
+def _serve(
+    place: OperatorHome, passphrase: bytes, keys: Keyring, changes: dict[str, int],
+    look: Callable[[], None] = lambda: None,
+) -> None:  # fmt: skip
+    """Run the server, with these keys of server.toml changed; what `look` raises ends it in good order."""
     from rosbridge_eth.administration import load_server_identity
     from rosbridge_eth.status import fleet
     from rosbridge_eth.supervisor import Secrets, Supervisor
@@ -392,7 +405,12 @@ def _serve(place: OperatorHome, passphrase: bytes, keys: Keyring, changes: dict[
         talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
 
     with live(lambda: fleet(place)) as show:
-        Supervisor(place, config, secrets).run(ready, show)
+
+        def on_look() -> None:
+            show()
+            look()
+
+        Supervisor(place, config, secrets).run(ready, on_look)
 
 
 def check(

@@ -286,9 +286,20 @@ class Ledger:
     def operator(self) -> str:
         return str(self._read("operator"))
 
-    def _read(self, function: str, *arguments: Any, block: int | str = "latest") -> Any:
+    def _read(self, function: str, *arguments: Any, block: Any = "latest") -> Any:
+        from web3.exceptions import BadFunctionCallOutput
+
         with self._node.asking():
-            return self._contract.functions[function](*arguments).call(block_identifier=block)
+            try:
+                return self._contract.functions[function](*arguments).call(block_identifier=block)
+            except BadFunctionCallOutput as error:
+                if self._w3.eth.get_code(self._contract.address, block):  # a contract that says something else
+                    raise
+                when = "the latest block" if block == "latest" else f"block {block}"
+                raise ChainError(
+                    f"there was no contract {self.contract} yet in {when} of {self.url}: ask for fewer confirmations,"
+                    " or wait until the chain or the node is further on"
+                ) from error
 
     # ------------------------------------------------------------------ events
 

@@ -112,7 +112,7 @@ def check_table(path: Path) -> None:
     if path.suffix not in (".csv", ".parquet"):
         raise ConfigError(f"{path}: a table is a .csv or a .parquet file")
     if path.suffix == ".parquet" and not find_spec("pyarrow"):
-        raise ConfigError(f"{path}: Parquet needs pyarrow; install pysmcrypto[parquet], or name a .csv file")
+        raise ConfigError(f"{path}: Parquet needs pyarrow: pip install pyarrow, or name a .csv file")
     _new(path, "table")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -103,3 +104,15 @@ def test_every_command_on_a_page_exists_with_its_options(page: str):
         assert name in group.commands, line
         options = {option for parameter in group.commands[name].params for option in (*parameter.opts,)} | {"--help"}
         assert {argument for argument in arguments if argument.startswith("--")} <= options, line
+
+
+def test_every_extra_that_is_named_is_one_of_the_distribution():
+    """In what the programs and the pages say: `pip install '.[bridge]'`, `NAME[parquet]`, a wheel's `…whl[bridge]`."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), ROOT / ".ci/run"]
+    form = re.compile(r"([\w.-]*smcrypto[\w.-]*|(?<=')\.|WHEEL)\[([a-z0-9,]+)\]")
+    named = [(file.name, *found) for file in files for found in form.findall(file.read_text(encoding="utf-8"))]
+    assert len(named) > 10
+    for file, distribution, extras in named:
+        assert distribution in (".", "WHEEL", project["name"]) or distribution.endswith(".whl"), (file, distribution)
+        assert set(extras.split(",")) <= project["optional-dependencies"].keys(), (file, extras)

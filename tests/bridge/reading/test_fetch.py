@@ -118,6 +118,12 @@ def test_confirmations_leave_the_newest_blocks_for_later(chain):
     assert reading.verdict().sound
 
 
+def test_a_block_from_before_the_contract_is_told_in_a_sentence(chain):
+    chain.write(chain.pen.chunks(1))
+    with pytest.raises(ChainError, match="no contract 0x.* yet in block 0 of .*fewer confirmations"):
+        chain.read(confirmations=100)
+
+
 def test_more_confirmations_than_last_time_are_no_roll_back(chain, tmp_path):
     bookmarks = Bookmarks(tmp_path / "bookmarks.json")
     for _ in range(4):
