@@ -402,15 +402,21 @@ class Proof:
     path: tuple[bytes, ...]
 
 
-def prove(lines: Sequence[bytes], key: bytes, index: int) -> Proof:
-    """The proof of `lines[index]` among all the lines of a chunk (RFC 9162, 2.1.3.1)."""
-    if not 0 <= index < len(lines):
-        raise ValueError(f"there is no record {index} among {len(lines)}")
+def proofs(lines: Sequence[bytes], key: bytes, indexes: Iterable[int]) -> Iterator[Proof]:
+    """The proof of each `lines[index]` among all the lines of a chunk (RFC 9162, 2.1.3.1)."""
     levels = _levels(_leaves(lines, key))
-    path = tuple(
-        level[place] for height, level in enumerate(levels[:-1]) if (place := index >> height ^ 1) < len(level)
-    )
-    return Proof(index, next(_salts(key, [index])), path)
+    for index in indexes:
+        if not 0 <= index < len(lines):
+            raise ValueError(f"there is no record {index} among {len(lines)}")
+        path = tuple(
+            level[place] for height, level in enumerate(levels[:-1]) if (place := index >> height ^ 1) < len(level)
+        )
+        yield Proof(index, next(_salts(key, [index])), path)
+
+
+def prove(lines: Sequence[bytes], key: bytes, index: int) -> Proof:
+    """The proof of one of them."""
+    return next(proofs(lines, key, [index]))
 
 
 def check_proof(root: bytes, records: int, line: bytes, proof: Proof) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -110,6 +111,14 @@ def test_ros_2(place: Path):
 def test_black_box(place: Path):
     (place / "robot" / "robot.toml").unlink()
     type_page("howto-black-box.md", place, before=SERVER)
+
+
+def test_evidence(place: Path, made: tuple[Path, Anvil]):
+    (place / "robot" / "robot.toml").unlink()
+    type_page("howto-evidence.md", place, before=SERVER, ports={"8545": int(made[1].url.rpartition(":")[2])})
+    shown = json.loads((place / "shown.json").read_text())
+    assert len(shown["records"]) == 50 and len((place / "records.jsonl").read_text().splitlines()) == 1
+    assert b"<html" in (place / "moment.html").read_bytes()
 
 
 def test_redis(place: Path, require: Callable[[str], str]):

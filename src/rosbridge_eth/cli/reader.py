@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from datetime import datetime
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -21,7 +22,7 @@ from rosbridge_eth.config.values import Address, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
-from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
+from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger
@@ -34,9 +35,19 @@ def add_commands(app: typer.Typer) -> None:
         " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
     )(read)
     app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
+    app.command(epilog="Example: rosbridge-eth evidence robot_1 crash.html --at 2026-11-21T10:00:00Z")(evidence)
+    app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
 
 
 RobotName: TypeAlias = Annotated[str, typer.Argument(help="The robot's name.")]
+Topic: TypeAlias = Annotated[str | None, typer.Option(help="Only this topic.")]
+From: TypeAlias = Annotated[
+    str | None, typer.Option("--from", help="Only what was received from this time on.")
+]
+To: TypeAlias = Annotated[str | None, typer.Option(help="Only what was received before this time.")]
+At: TypeAlias = Annotated[
+    str | None, typer.Option(help="Only the last record of each topic up to this moment.")
+]
 Nodes: TypeAlias = Annotated[
     list[str] | None, typer.Option("--node", help="Ask these nodes, not those of reader.toml.")
 ]
@@ -62,13 +73,24 @@ def _address(text: str | None) -> Address | None:
         raise typer.BadParameter(f"{text!r}: write a port, or HOST:PORT", param_hint="--serve") from error
 
 
+def _choice(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
+    from rosbridge_eth.reading import Choice
+
+    choice = Choice(topic, _time(from_), _time(to), _time(at))
+    if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
+        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
+    if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
+        raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
+    return choice
+
+
 def read(
     robot: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="The robot's name; several with --serve.")],
     home: ReaderHomeOption = READER_HOME,
-    topic: Annotated[str | None, typer.Option(help="Only this topic.")] = None,
-    from_: Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")] = None,
-    to: Annotated[str | None, typer.Option(help="Only what was received before this time.")] = None,
-    at: Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")] = None,
+    topic: Topic = None,
+    from_: From = None,
+    to: To = None,
+    at: At = None,
     bag: Annotated[Path | None, typer.Option(help="Write NAME.bag (ROS 1), NAME.mcap, NAME.db3 or a folder.")] = None,
     table: Annotated[Path | None, typer.Option(help="Write NAME.csv or NAME.parquet.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw the trajectory: .png, .svg or .pdf.")] = None,
@@ -91,14 +113,9 @@ def read(
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
     sealed for others. With --follow, .mcap and .csv files grow; others are there at the end.
     """
-    from rosbridge_eth.reading import Choice, outputs
-    from rosbridge_eth.reading.verdict import shown
+    from rosbridge_eth.reading import outputs
 
-    choice = Choice(topic, _time(from_), _time(to), _time(at))
-    if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
-        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
-    if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
-        raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
+    choice = _choice(topic, from_, to, at)
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     address = _address(serve)
@@ -154,9 +171,8 @@ def read(
     if made is not None:
         of = made.summary
         talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
-    if topic is not None and not follow and not chosen[name] and topic not in reading.topics:
-        there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
-        talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
+    if not follow and not chosen[name]:
+        _tell_topics(topic, reading)
     for name, of_it in said.items():
         _require_sound(place, name, of_it)
     if plot is not None and not picture.draw(plot):
@@ -201,6 +217,79 @@ def compare(
     _require_sound(place, robot, said)
     if made.wrong or not made.equal:
         raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
+
+
+def evidence(
+    robot: RobotName,
+    file: Annotated[Path, typer.Argument(help="The file to write; as a page that checks itself if it ends in .html.")],
+    home: ReaderHomeOption = READER_HOME,
+    topic: Topic = None,
+    from_: From = None,
+    to: To = None,
+    at: At = None,
+    node: Nodes = None,
+    confirmations: Confirmations = 1,
+    confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Write one file that proves chosen records to somebody who has neither key nor node. It opens nothing else.
+
+    Exits with 9, like read, where the log that they are from is not sound; the file is written nevertheless.
+    """
+    from rosbridge_eth.files import write_atomically
+    from rosbridge_eth.reading import evidence as making
+
+    choice = _choice(topic, from_, to, at)
+    if choice == _choice(None, None, None, None):
+        raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
+    if file.exists() or not file.parent.is_dir():
+        raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
+    place = ReaderHome(home).require()
+    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+        records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
+        for _ in reading.chunks:
+            continue  # the verdict is on all of the log
+        if not records:
+            _tell_topics(topic, reading)
+            raise ConfigError("no record was chosen; nothing is written")
+        made = making.make(reading, records)
+    write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
+    talk(f"{file}: {len(made.records):,} records, for `verify {file} --ca ca.crt.pem`; who has it can read them")
+    _require_sound(place, robot, said)
+
+
+def verify(
+    file: Annotated[Path, typer.Argument(help="What `evidence` wrote, JSON or page.")],
+    ca: Annotated[Path, typer.Option(help="The CA's certificate (PEM): from the operator, not from who has the file.")],
+    node: Annotated[str | None, typer.Option(help="Ask this node whether the blocks are its chain's.")] = None,
+    json: Json = False,
+) -> None:
+    """Check evidence, without a node: what it shows goes to stdout as JSON lines, and what that proves is said.
+
+    Exits with 9 where anything does not hold, with 7 where the node named does not answer.
+    """
+    from rosbridge_eth.identity import read_certificates
+    from rosbridge_eth.reading import evidence as checking
+
+    data = read_given(file)
+    given = checking.Evidence.read(data)
+    found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
+    if node is not None:
+        checking.ask(found, node)
+        talk(f"holds: all {len(found.blocks)} blocks are those of the chain, says {node}")
+    if json:
+        print_json(found.as_json())
+    else:
+        for record in found.records:
+            print(record.json_line(), end="")
+    talk("What this proves:")
+    for line in found.proves():
+        talk(f"- {line}")
+    talk("What it does not prove:")
+    for line in found.proves_not("" if node is None else node):
+        talk(f"- {line}")
+    if data.strip().decode() not in (given.encode(), given.page().strip()):
+        talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
 
 
 @contextmanager
@@ -291,6 +380,15 @@ def _following(
         said[robot.name] = verdict.as_json()
         for line in verdict.lines():
             talk(line)
+
+
+def _tell_topics(topic: str | None, reading: Reading) -> None:
+    """Nothing was chosen: what there is, for who named a topic that is not there."""
+    from rosbridge_eth.reading.verdict import shown
+
+    if topic is not None and topic not in reading.topics:
+        there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
+        talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
 
 
 def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:

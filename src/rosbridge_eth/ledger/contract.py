@@ -37,6 +37,7 @@ PAGE = 500  # robots in one `standings`
 SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
 SENT_AT_ONCE = 4  # of 200 kB in hex at most; nginx takes 1 MB where nobody said otherwise, anvil 2, geth 5
 _Event = TypeVar("_Event")
+_Answer = TypeVar("_Answer")
 _Maker = Callable[[Any, Any], _Event]
 
 
@@ -246,14 +247,18 @@ class Ledger:
         with self._node.asking():
             return natural(self._w3.eth.get_balance(self._w3.to_checksum_address(account)), 2**256)
 
-    def nonces(self, accounts: Sequence[str]) -> list[tuple[int, int]]:
-        """For each account how many transactions are in blocks, and how many with those that wait in the pool."""
-        asked = [("eth_getTransactionCount", [a, tag]) for a in accounts for tag in ("latest", "pending")]
-        answers = self._node.many(asked)
+    def ask(self, requests: Sequence[tuple[str, list[Any]]], form: Callable[[list[Any]], _Answer]) -> _Answer:
+        """What `form` makes of the node's answers to these calls of JSON-RPC; ChainError where it refuses one."""
+        answers = self._node.many(requests)
         with self._node.asking():
             if refused := [answer for answer in answers if isinstance(answer, ChainError)]:
                 raise refused[0]
-            counts = [natural(answer) for answer in answers]
+            return form(answers)
+
+    def nonces(self, accounts: Sequence[str]) -> list[tuple[int, int]]:
+        """For each account how many transactions are in blocks, and how many with those that wait in the pool."""
+        asked = [("eth_getTransactionCount", [a, tag]) for a in accounts for tag in ("latest", "pending")]
+        counts = self.ask(asked, lambda answers: [natural(answer) for answer in answers])
         return list(zip(counts[::2], counts[1::2], strict=True))
 
     def fees(self, head: Block) -> Fees:

@@ -26,14 +26,18 @@ MARGIN = 128
 class Reading:
     """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
 
-    top: the block up to which is read. kept: of earlier readings; `chunks` are those behind it. topics: that were read
-    so far.
+    top: the block up to which is read. ledger: on the node that is read. reader, trust, bodies: of who reads. kept: of
+    earlier readings; `chunks` are those behind it. topics: that were read so far.
     """
 
     verifier: Verifier
     chunks: Iterator[ProvenChunk]
     nodes: Sequence[str]
     top: Block
+    ledger: Ledger
+    reader: sm2.PrivateKey | None
+    trust: Trust
+    bodies: Bodies | None = None
     kept: Cache | None = None
     topics: set[str] = field(default_factory=set)
 
@@ -110,7 +114,7 @@ def read_robot(
         chunks = verifier.read(events)
     else:
         chunks = _keeping(kept, verifier, events, ledger.block(max(0, block - MARGIN)))
-    return Reading(verifier, _settled(ledger, top, chunks), told, top, kept)
+    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, reader, trust, bodies, kept)
 
 
 def _still_there(ledger: Ledger, seen: Block, block: int) -> bool:

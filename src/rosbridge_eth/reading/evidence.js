@@ -1,0 +1,625 @@
+// SPDX-License-Identifier: Apache-2.0
+// Checks the evidence of a robot's records, as docs/evidence.md says it, with nothing but the language: SM3, keccak-256,
+// SM2 signatures, X.509 (RFC 5280, as far as a robot's certificates go), RLP and Merkle-Patricia tries. It is written
+// from that page and docs/log.md, not from the Python; tests hold both against each other and against the standards.
+//
+// evidence.verify(text, told) gives what the file shows, or throws a Wrong that says what does not hold.
+'use strict'
+const evidence = (() => {
+  class Wrong extends Error {}
+  const need = (holds, why) => {
+    if (!holds) throw new Wrong(why)
+  }
+
+  // ---------------------------------------------------------------- bytes
+
+  const utf8 = new TextEncoder()
+  const DIGITS = [...Array(256).keys()].map((byte) => byte.toString(16).padStart(2, '0'))
+  const hex = (bytes) => {
+    let text = ''
+    for (const byte of bytes) text += DIGITS[byte]
+    return text
+  }
+  const unhex = (text, size, what) => {
+    need(typeof text === 'string' && /^(?:[0-9a-f]{2})*$/.test(text), `${what} is not lower-case hexadecimal`)
+    need(size === undefined || text.length === 2 * size, `${what} does not have ${size} bytes`)
+    const bytes = new Uint8Array(text.length / 2)
+    for (let n = 0; n < bytes.length; n++) bytes[n] = parseInt(text.substr(2 * n, 2), 16)
+    return bytes
+  }
+  const join = (...parts) => {
+    const bytes = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0))
+    let at = 0
+    for (const part of parts) {
+      bytes.set(part, at)
+      at += part.length
+    }
+    return bytes
+  }
+  const big = (bytes) => BigInt('0x' + (hex(bytes) || '0'))
+  const small = (bytes, what) => {
+    const value = big(bytes)
+    need(value < 2n ** 53n, `${what} is beyond all bounds`)
+    return Number(value)
+  }
+  const word = (value, size = 32) => unhex(BigInt(value).toString(16).padStart(2 * size, '0'))
+  const same = (a, b) => a.length === b.length && a.every((byte, n) => byte === b[n])
+
+  // ---------------------------------------------------------------- SM3, GB/T 32905-2016
+
+  const rotl = (x, n) => (x << n) | (x >>> (32 - n)) // JavaScript takes both counts modulo 32
+
+  function sm3(...parts) {
+    const message = join(...parts)
+    const padded = new Uint8Array(Math.ceil((message.length + 9) / 64) * 64)
+    padded.set(message)
+    padded[message.length] = 0x80
+    const view = new DataView(padded.buffer)
+    view.setBigUint64(padded.length - 8, BigInt(message.length) * 8n)
+    const v = Int32Array.of(
+      0x7380166f, 0x4914b2b9, 0x172442d7, 0xda8a0600, 0xa96f30bc, 0x163138aa, 0xe38dee4d, 0xb0fb0e4e)
+    const w = new Int32Array(68)
+    const p1 = (x) => x ^ rotl(x, 15) ^ rotl(x, 23)
+    for (let at = 0; at < padded.length; at += 64) {
+      for (let j = 0; j < 16; j++) w[j] = view.getInt32(at + 4 * j)
+      for (let j = 16; j < 68; j++) {
+        w[j] = p1(w[j - 16] ^ w[j - 9] ^ rotl(w[j - 3], 15)) ^ rotl(w[j - 13], 7) ^ w[j - 6]
+      }
+      let [a, b, c, d, e, f, g, h] = v
+      for (let j = 0; j < 64; j++) {
+        const first = j < 16
+        const ss1 = rotl((rotl(a, 12) + e + rotl(first ? 0x79cc4519 : 0x7a879d8a, j)) | 0, 7)
+        const tt1 = ((first ? a ^ b ^ c : (a & b) | (a & c) | (b & c)) + d + (ss1 ^ rotl(a, 12)) + (w[j] ^ w[j + 4])) | 0
+        const tt2 = ((first ? e ^ f ^ g : (e & f) | (~e & g)) + h + ss1 + w[j]) | 0
+        ;[d, c, b, a] = [c, rotl(b, 9), a, tt1]
+        ;[h, g, f, e] = [g, rotl(f, 19), e, tt2 ^ rotl(tt2, 9) ^ rotl(tt2, 17)]
+      }
+      ;[a, b, c, d, e, f, g, h].forEach((value, n) => (v[n] ^= value))
+    }
+    const digest = new DataView(new ArrayBuffer(32))
+    v.forEach((value, n) => digest.setInt32(4 * n, value))
+    return new Uint8Array(digest.buffer)
+  }
+
+  // ---------------------------------------------------------------- keccak-256 (Ethereum's: the padding before FIPS 202)
+
+  // Lanes are pairs of 32 bits, low one first. Places and turns of rho and pi, and the constants of iota, as FIPS 202
+  // derives them (3.2.2 to 3.2.5).
+  const PLACES = []
+  const TURNS = []
+  const CONSTANTS = []
+  for (let round = 0, x = 1, y = 0, lfsr = 1; round < 24; round++) {
+    ;[x, y] = [y, (2 * x + 3 * y) % 5]
+    PLACES.push(2 * (5 * y + x))
+    TURNS.push((((round + 1) * (round + 2)) / 2) % 64)
+    const constant = [0, 0]
+    for (let j = 0; j < 7; j++) {
+      if (lfsr & 1) constant[j === 6 ? 1 : 0] |= 1 << (2 ** j - 1) % 32
+      lfsr = ((lfsr << 1) ^ ((lfsr >> 7) * 0x171)) & 0xff
+    }
+    CONSTANTS.push(constant)
+  }
+  const turn = (low, high, n) => (n < 32 ? (low << n) | (high >>> (32 - n)) : (high << (n - 32)) | (low >>> (64 - n)))
+
+  function permute(s) {
+    const c = new Int32Array(10)
+    for (const [low, high] of CONSTANTS) {
+      for (let x = 0; x < 10; x++) c[x] = s[x] ^ s[x + 10] ^ s[x + 20] ^ s[x + 30] ^ s[x + 40]
+      for (let x = 0; x < 10; x += 2) {
+        const before = (x + 8) % 10
+        const after = (x + 2) % 10
+        const l = c[before] ^ turn(c[after], c[after + 1], 1)
+        const h = c[before + 1] ^ turn(c[after + 1], c[after], 1)
+        for (let y = x; y < 50; y += 10) {
+          s[y] ^= l
+          s[y + 1] ^= h
+        }
+      }
+      let l = s[2]
+      let h = s[3]
+      for (let t = 0; t < 24; t++) {
+        const place = PLACES[t]
+        const [nextL, nextH] = [s[place], s[place + 1]]
+        s[place] = turn(l, h, TURNS[t])
+        s[place + 1] = turn(h, l, TURNS[t])
+        ;[l, h] = [nextL, nextH]
+      }
+      for (let y = 0; y < 50; y += 10) {
+        for (let x = 0; x < 10; x++) c[x] = s[y + x]
+        for (let x = 0; x < 10; x++) s[y + x] ^= ~c[(x + 2) % 10] & c[(x + 4) % 10]
+      }
+      s[0] ^= low
+      s[1] ^= high
+    }
+  }
+
+  function keccak(...parts) {
+    const message = join(...parts)
+    const padded = new Uint8Array((Math.floor(message.length / 136) + 1) * 136)
+    padded.set(message)
+    padded[message.length] ^= 0x01
+    padded[padded.length - 1] ^= 0x80
+    const view = new DataView(padded.buffer)
+    const s = new Int32Array(50)
+    for (let at = 0; at < padded.length; at += 136) {
+      for (let n = 0; n < 34; n++) s[n] ^= view.getInt32(at + 4 * n, true)
+      permute(s)
+    }
+    const digest = new DataView(new ArrayBuffer(32))
+    for (let n = 0; n < 8; n++) digest.setInt32(4 * n, s[n], true)
+    return new Uint8Array(digest.buffer)
+  }
+
+  // ---------------------------------------------------------------- SM2 signatures, GB/T 32918.2-2016, 7.1
+
+  const P = 0xfffffffeffffffffffffffffffffffffffffffff00000000ffffffffffffffffn
+  const B = 0x28e9fa9e9d9f5e344d5a9e4bcf6509a7f39789f515ab8f92ddbcbd414d940e93n
+  const N = 0xfffffffeffffffffffffffffffffffff7203df6b21c6052b53bbf40939d54123n
+  const G = [
+    0x32c4ae2c1f1981195f9904466a39c9948fe30bbff2660be1715a4589334c74c7n,
+    0xbc3736a2f4f6779c59bdcee36b692153d0a9877cc62a474002df32e52139f0a0n, 1n]
+  const A = P - 3n
+  const mod = (x, m = P) => ((x % m) + m) % m
+
+  // Jacobian coordinates; z = 0 is infinity. EFD shortw-jacobian-3, dbl-2001-b and add-1998-cmo.
+  function double([x, y, z]) {
+    const [delta, gamma] = [(z * z) % P, (y * y) % P]
+    const beta = (x * gamma) % P
+    const alpha = mod(3n * (x - delta) * (x + delta))
+    const x3 = mod(alpha * alpha - 8n * beta)
+    return [x3, mod(alpha * (4n * beta - x3) - 8n * gamma * gamma), mod((y + z) * (y + z) - gamma - delta)]
+  }
+  function add(a, b) {
+    if (a[2] === 0n) return b
+    if (b[2] === 0n) return a
+    const [za, zb] = [(a[2] * a[2]) % P, (b[2] * b[2]) % P]
+    const [ua, ub] = [(a[0] * zb) % P, (b[0] * za) % P]
+    const sa = (((a[1] * zb) % P) * b[2]) % P
+    const h = mod(ub - ua)
+    const r = mod(((b[1] * za) % P) * a[2] - sa)
+    if (h === 0n) return r === 0n ? double(a) : [1n, 1n, 0n]
+    const hh = (h * h) % P
+    const [hhh, v] = [(h * hh) % P, (ua * hh) % P]
+    const x = mod(r * r - hhh - 2n * v)
+    return [x, mod(r * (v - x) - sa * hhh), (((h * a[2]) % P) * b[2]) % P]
+  }
+  function inverse(value) {
+    let [a, b, x, y] = [mod(value), P, 1n, 0n]
+    while (a > 1n) [a, b, x, y] = [b % a, a, y - (b / a) * x, x]
+    return mod(x)
+  }
+
+  // key: 04 | x | y; the signature's r and s; identifier 1234567812345678 (GM/T 0009).
+  function signed(key, message, r, s) {
+    const [x, y] = [big(key.subarray(1, 33)), big(key.subarray(33))]
+    const onCurve = key.length === 65 && key[0] === 4 && x < P && y < P && mod(y * y - x * x * x - A * x - B) === 0n
+    if (!onCurve || r < 1n || r >= N || s < 1n || s >= N) return false
+    const constants = [A, B, G[0], G[1]].map((value) => word(value))
+    const z = sm3([0, 128], utf8.encode('1234567812345678'), ...constants, key.subarray(1))
+    const e = big(sm3(z, message))
+    const t = (r + s) % N
+    if (t === 0n) return false
+    const point = [x, y, 1n]
+    const sums = [null, G, point, add(G, point)] // s * G + t * point, both at once
+    let sum = [1n, 1n, 0n]
+    for (let bit = 255n; bit >= 0n; bit--) {
+      sum = double(sum)
+      const which = Number((s >> bit) & 1n) + 2 * Number((t >> bit) & 1n)
+      if (which) sum = add(sum, sums[which])
+    }
+    if (sum[2] === 0n) return false
+    const i = inverse(sum[2])
+    return (e + ((sum[0] * ((i * i) % P)) % P)) % N === r
+  }
+
+  // ---------------------------------------------------------------- DER and X.509, RFC 5280
+
+  // One value: its tag, the whole of it, its content. DER's lengths have one form (X.690, 10.1).
+  function element(der, at = 0) {
+    let start = at + 2
+    let size = der[at + 1]
+    if (size >= 0x80) {
+      start += size & 0x7f
+      const length = der.subarray(at + 2, start)
+      need(length.length >= 1 && length.length <= 3 && length[0] !== 0, 'a certificate is not DER')
+      size = Number(big(length))
+      need(size >= 0x80, 'a certificate is not DER')
+    }
+    need(start + size <= der.length, 'a certificate ends early')
+    return { tag: der[at], whole: der.subarray(at, start + size), content: der.subarray(start, start + size) }
+  }
+  function elements(content) {
+    const found = []
+    for (let at = 0; at < content.length; at += found.at(-1).whole.length) found.push(element(content, at))
+    return found
+  }
+  const one = (der) => {
+    const found = element(der)
+    need(found.whole.length === der.length, 'there is something behind a DER value')
+    return found
+  }
+  const within = (part, tag) => {
+    need(part?.tag === tag, 'a certificate is not in the form of one')
+    return elements(part.content)
+  }
+  const SM2_WITH_SM3 = '06082a811ccf55018375'
+  const SM2_KEY = '301306072a8648ce3d020106082a811ccf5501822d'
+  const moment = ({ tag, content }) => {
+    const text = String.fromCharCode(...content)
+    const full = tag === 0x17 ? (text < '50' ? '20' : '19') + text : text
+    const time = Date.parse(full.replace(/^(\d{4})(\d\d)(\d\d)(\d\d)(\d\d)(\d\d)Z$/, '$1-$2-$3T$4:$5:$6Z'))
+    need(!Number.isNaN(time), 'a certificate has a time that is none')
+    return time
+  }
+  const bits = (part) => {
+    need(part?.tag === 0x03 && part.content.length > 0, 'a certificate is not in the form of one')
+    return part.content.subarray(1)
+  }
+
+  function certificate(der) {
+    const [tbs, algorithm, signature] = within(one(der), 0x30)
+    const [version, , inner, issuer, validity, subject, key, ...rest] = within(tbs, 0x30)
+    need(version?.tag === 0xa0 && hex(version.content) === '020102', 'a certificate is not of version 3')
+    for (const used of [algorithm, inner]) {
+      need(hex(within(used, 0x30)[0].whole) === SM2_WITH_SM3, 'a certificate is not signed with SM2 and SM3')
+    }
+    const [kind, point] = within(key, 0x30)
+    need(hex(kind.whole) === SM2_KEY, 'a certificate is not for an SM2 key')
+    const [from, until] = within(validity, 0x30).map(moment)
+    const found = { tbs: tbs.whole, issuer: hex(issuer.whole), subject: hex(subject.whole), key: bits(point), from, until }
+    const [r, s] = within(one(bits(signature)), 0x30).map(({ content }) => big(content))
+    Object.assign(found, { r, s, authority: false, usage: null, purposes: [], names: [] })
+    const extensions = rest.find(({ tag }) => tag === 0xa3)
+    for (const extension of extensions ? within(one(extensions.content), 0x30) : []) {
+      const parts = within(extension, 0x30)
+      const id = hex(parts[0].content)
+      const value = parts.at(-1).content
+      if (id === '551d13') found.authority = within(one(value), 0x30).some(({ tag, content }) => tag === 1 && content[0])
+      else if (id === '551d0f') found.usage = bits(one(value))[0] // digitalSignature 80 ... keyAgreement 08, keyCertSign 04
+      else if (id === '551d25') found.purposes = within(one(value), 0x30).map(({ content }) => hex(content))
+      else if (id === '551d11') {
+        found.names = within(one(value), 0x30).map(({ tag, content }) => [tag & 0x1f, String.fromCharCode(...content)])
+      } else need(parts.length === 2 || !parts[1].content[0], `a certificate has a critical extension, ${id}`)
+    }
+    return found
+  }
+
+  // The robot's signing certificate in a registration, if the CA signed both for this robot and they had not ended then.
+  // A certificate that begins later than its block is a chain whose clock is behind.
+  function signer(certificates, roots, robot, blockTime) {
+    const first = element(certificates).whole
+    const pair = [certificate(first), certificate(certificates.subarray(first.length))]
+    const at = Math.max(blockTime * 1000, ...pair.map(({ from }) => from))
+    pair.forEach((made, n) => {
+      const name = `6,urn:rosbridge-eth:robot:${robot}`
+      need(made.names.length === 1 && String(made.names[0]) === name, `a certificate is not for ${robot}`)
+      const issued = (root) =>
+        root.subject === made.issuer && root.authority && (root.usage === null || root.usage & 0x04) &&
+        root.from <= at && at <= root.until && signed(root.key, made.tbs, made.r, made.s)
+      need(roots.some(issued), 'the CA did not sign a certificate')
+      need(made.from <= at && at <= made.until, 'a certificate had ended when it was registered')
+      const [own, others] = n ? [0x08, 0x80] : [0x80, 0x38]
+      need(made.usage & own && !(made.usage & others), 'a certificate is for another use')
+      need(made.purposes.includes('2b06010505070302'), 'a certificate is for another purpose')
+    })
+    return { key: pair[0].key, fingerprint: hex(sm3(first)), until: Math.min(pair[0].until, pair[1].until) }
+  }
+
+  // ---------------------------------------------------------------- RLP and tries, Ethereum's yellow paper, B and D
+
+  // A string is its bytes; a list is { list: its encoding }, which `items` takes apart, one level at a time.
+  function extent(data, at) {
+    need(at < data.length, 'an RLP item ends early')
+    const first = data[at]
+    if (first < 0x80) return [false, at, at + 1]
+    let size = first & 0x3f
+    let start = at + 1
+    if (size >= 56) {
+      start += size - 55
+      const length = data.subarray(at + 1, start)
+      need(length[0] !== 0, 'an RLP length is not in its one form')
+      size = small(length, 'an RLP length')
+      need(size >= 56, 'an RLP length is not in its one form')
+    } else need(first !== 0x81 || data[start] >= 0x80, 'an RLP string is not in its one form')
+    need(start + size <= data.length, 'an RLP item ends early')
+    return [first >= 0xc0, start, start + size]
+  }
+  function items(data) {
+    let [isList, at, end] = extent(data, 0)
+    need(isList && end === data.length, 'what should be an RLP list is none')
+    const found = []
+    while (at < end) {
+      const [list, start, stop] = extent(data, at)
+      found.push(list ? { list: data.subarray(at, stop) } : data.subarray(start, stop))
+      at = stop
+    }
+    need(at === end, 'what should be an RLP list is none')
+    return found
+  }
+  const string = (item, what) => {
+    need(item instanceof Uint8Array, `${what} is not in the form of one`)
+    return item
+  }
+  const rlpIndex = (n) => {
+    const bytes = n ? word(n, Math.ceil(n.toString(16).length / 2)) : new Uint8Array(0)
+    return bytes.length === 1 && bytes[0] < 0x80 ? bytes : join([0x80 + bytes.length], bytes)
+  }
+
+  class Nodes {
+    constructor(list) {
+      this.byHash = new Map(list.map((node) => [hex(keccak(node)), node]))
+      this.used = new Set()
+      need(this.byHash.size === list.length, 'a node of a trie is there twice')
+    }
+
+    get(root, key, what) {
+      const missing = `the trie does not have ${what}`
+      let path = hex(key)
+      let node = this.at(root, what)
+      for (;;) {
+        const parts = items(node)
+        let child
+        if (parts.length === 17 && path) {
+          child = parts[parseInt(path[0], 16)]
+          path = path.slice(1)
+        } else {
+          need(parts.length === 2 && parts[0] instanceof Uint8Array && parts[0].length, missing)
+          const prefix = hex(parts[0])
+          const flag = parseInt(prefix[0], 16)
+          const shared = prefix.slice(flag & 1 ? 1 : 2)
+          need(flag <= 3 && path.startsWith(shared), missing)
+          path = path.slice(shared.length)
+          child = parts[1]
+          if (flag & 2) {
+            need(!path, missing)
+            return string(child, what)
+          }
+        }
+        node = child.list ?? this.at(child, what)
+      }
+    }
+
+    at(hash, what) {
+      const name = hex(hash)
+      need(this.byHash.has(name), `the proof of ${what} does not hold: a node of its trie is missing`)
+      this.used.add(name)
+      return this.byHash.get(name)
+    }
+  }
+
+  // ---------------------------------------------------------------- the contract RobotLedger
+
+  const CODE = 'd06d5cfc15aef121b4bf5a5aabe51d006fb9f820dc919102b3e4b135ff697e5c'
+  const topic = (text) => hex(keccak(utf8.encode(text)))
+  const DATA = topic('Data(bytes32,uint256,address,uint256,bytes[])')
+  const REGISTERED = topic('Registered(bytes32,address,uint256,uint256,bytes)')
+  const REVOKED = topic('Revoked(bytes32,address,uint256,uint256)')
+
+  function* eventsOf(receipt, contract, tk, block) {
+    const fields = items(receipt[0] < 0x80 ? receipt.subarray(1) : receipt)
+    need(fields.length === 4 && fields[3].list, 'a receipt is not in the form of one')
+    for (const log of items(fields[3].list)) {
+      const [address, topics, data] = items(log.list ?? string(null, 'a log'))
+      const [kind, robot, ...more] = items(topics.list ?? string(null, 'a log')).map((one) => string(one, 'a topic'))
+      if (!kind || !same(address, contract) || !robot || !same(robot, tk)) continue
+      const number = (at) => {
+        need(at + 32 <= data.length, 'an event ends early')
+        return small(data.subarray(at, at + 32), 'a number in an event')
+      }
+      const blob = (at) => {
+        const end = at + 32 + number(at)
+        need(end <= data.length, 'an event ends early')
+        return data.subarray(at + 32, end)
+      }
+      if (hex(kind) === DATA) {
+        const [count, chunks] = [number(64), []]
+        let place = 32 * count
+        for (let n = 0; n < count; n++) {
+          need(number(96 + 32 * n) === place, 'an event is not as Solidity writes it')
+          chunks.push(blob(96 + place))
+          place += 32 + Math.ceil(chunks[n].length / 32) * 32
+        }
+        yield { data: true, first: small(more[0], 'the number of a chunk'), chunks, block }
+      } else if (hex(kind) === REGISTERED) {
+        yield { index: number(0), previous: number(32), certificates: blob(96), block }
+      } else if (hex(kind) === REVOKED) yield { index: number(0), previous: number(32), revoked: true, block }
+    }
+  }
+
+  // ---------------------------------------------------------------- the chunk, docs/log.md
+
+  function chunkOf(data) {
+    const count = data[138]
+    const end = 139 + count * 121
+    need(data.length >= end + 64 && data[0] === 2 && data[1] <= 3 && count <= 16, 'a chunk is not in the form of one')
+    const header = data.subarray(0, end)
+    const field = (at, size) => header.subarray(at, at + size)
+    const rest = data.length - end - 64
+    const length = small(field(102, 4))
+    need(rest === 0 || rest === length, 'a chunk is not in the form of one')
+    return {
+      encoded: header, digest: hex(sm3(header)), stream: hex(field(2, 16)), number: String(big(field(18, 8))),
+      sealed: small(field(58, 8), 'when a chunk was sealed'), records: small(field(66, 4)), root: field(70, 32),
+      r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0 && length > 0,
+    }
+  }
+
+  // RFC 9162, 2.1.3.2, with its names.
+  function proven(root, records, index, salt, line, path) {
+    let [fn, sn] = [index, records - 1]
+    let r = sm3([0], salt, line)
+    if (fn > sn) return false
+    for (const p of path) {
+      if (sn === 0) return false
+      if (fn & 1 || fn === sn) {
+        r = sm3([1], p, r)
+        while (fn && !(fn & 1)) [fn, sn] = [fn >> 1, sn >> 1]
+      } else r = sm3([1], r, p)
+      ;[fn, sn] = [fn >> 1, sn >> 1]
+    }
+    return sn === 0 && same(r, root)
+  }
+
+  // A record's line, its long integers as text: JavaScript's numbers would lose digits of the times.
+  function parsed(line) {
+    const exact = line.replace(/"(?:[^"\\]|\\.)*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?/g, (token) =>
+      token.length > 15 && /^-?\d+$/.test(token) ? `"${token}"` : token)
+    const value = JSON.parse(exact)
+    need(Object.keys(value).join() === 'topic,type,source,received_ns,captured_ns,clock,data', 'it is no captured message')
+    return value
+  }
+
+  // ---------------------------------------------------------------- the file
+
+  const ascending = (list) => list.every((value, n) => n === 0 || list[n - 1] < value)
+  const isCount = (value) => Number.isInteger(value) && value >= 0 && value < 2 ** 53
+  const list = (value, what) => {
+    need(Array.isArray(value), `${what} are no list`)
+    return value
+  }
+  const members = (value, names, what) => {
+    need(value !== null && typeof value === 'object' && Object.keys(value).join() === names, `${what} is not in its form`)
+    return value
+  }
+
+  function read(text) {
+    let file
+    try {
+      file = JSON.parse(text)
+    } catch {
+      throw new Wrong('this is no evidence: it is not JSON')
+    }
+    members(file, 'format,robot,chain_id,genesis,contract,authorities,records,blocks,nodes', 'the file')
+    need(file.format === 'rosbridge-eth evidence 1', 'this is evidence of another format')
+    const escaped = (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0')
+    need(JSON.stringify(file).replace(/[<\u007f-\uffff]/g, escaped) === text.trim(), 'the file is not in its one form')
+    need(typeof file.robot === 'string' && /^[a-z0-9][a-z0-9_.-]{0,62}$/.test(file.robot), 'no robot has such a name')
+    need(isCount(file.chain_id), 'the chain has no such id')
+    for (const block of list(file.blocks, 'the blocks')) members(block, 'hash,header,receipts', 'a block')
+    for (const record of list(file.records, 'the records')) {
+      members(record, 'chunk,record,line,salt,path', 'a record')
+      need(isCount(record.chunk) && isCount(record.record) && record.record < 1000, 'a record has no place')
+      need(typeof record.line === 'string', 'a record has no line')
+    }
+    need(file.records.length > 0 && file.blocks.length > 0, 'there is nothing in the file')
+    return file
+  }
+
+  function verify(text, told) {
+    const file = read(text)
+    const { robot } = file
+    const [genesis, contract] = [unhex(file.genesis, 32, 'the first block'), unhex(file.contract, 20, 'the contract')]
+    const tk = keccak(utf8.encode(robot))
+    const log = join(sm3(word(file.chain_id), genesis, contract), tk)
+    const authorities = list(file.authorities, 'the CAs').map((one) => unhex(one, undefined, "a CA's certificate"))
+    told('the file is whole and in its one form')
+
+    // blocks and events
+    const nodes = new Nodes(list(file.nodes, 'the nodes').map((node) => unhex(node, undefined, 'a node')))
+    const events = []
+    const blocks = file.blocks.map((block) => {
+      const encoded = unhex(block.header, undefined, 'a header')
+      const fields = items(encoded)
+      need(fields.length >= 15 && fields.length <= 21, "a block's header is not in the form of one")
+      const [state, receipts, number, time] = [3, 5, 8, 11].map((n) => string(fields[n], "a block's header"))
+      need(same(unhex(block.hash, 32, "a block's hash"), keccak(encoded)), "a block's header does not have its hash")
+      const [at, when] = [small(number, "a block's number"), small(time, "a block's time")]
+      return { number: at, time: when, state, receipts, hash: block.hash, shows: block.receipts }
+    })
+    const last = blocks.at(-1)
+    need(ascending(blocks.map(({ number }) => number)), 'the blocks are not in order')
+    for (const block of blocks) {
+      const inOrder = list(block.shows, 'the receipts').every(isCount) && ascending(block.shows)
+      need(inOrder && (block.shows.length || block === last), `block ${block.number} shows no receipts, or not in order`)
+      for (const index of block.shows) {
+        const what = `receipt ${index} of block ${block.number}`
+        const found = [...eventsOf(nodes.get(block.receipts, rlpIndex(index), what), contract, tk, block)]
+        need(found.length, `${what} has no event of ${robot}`)
+        events.push(...found)
+      }
+    }
+    told(`the contract's events are in these blocks, by the receipts under their receiptsRoot`)
+
+    // the contract's storage
+    const account = items(nodes.get(last.state, keccak(contract), `the contract in block ${last.number}`))
+    need(account.length === 4 && hex(string(account[3], 'an account')) === CODE,
+      "what is at the contract's address is not RobotLedger of this edition")
+    const slot = (key) => {
+      const value = nodes.get(account[2], keccak(key), "a slot of the contract's storage")
+      const [isList, start, end] = extent(value, 0)
+      need(!isList && end === value.length, 'a slot is not in the form of one')
+      return big(value.subarray(start, end))
+    }
+    const base = big(keccak(tk, word(2)))
+    const [packed, , certificatesHash, changed] = [0n, 1n, 2n, 3n].map((n) => slot(word((base + n) % 2n ** 256n)))
+    const state = { revoked: ((packed >> 160n) & 0xffn) !== 0n, chunks: Number((packed >> 168n) & (2n ** 40n - 1n)) }
+    const batches = keccak(tk, word(4))
+    const written = new Map()
+    for (const { first, chunks, block } of events.filter(({ data }) => data)) {
+      const kept = slot(keccak(word(first), batches)) === big(keccak(...chunks.map((chunk) => keccak(chunk))))
+      need(kept && first + chunks.length <= state.chunks, `the contract does not have the batch that begins with ${first}`)
+      chunks.forEach((chunk, n) => written.set(first + n, { chunk, block }))
+    }
+    told(`the contract is RobotLedger and has these chunks and registrations, by the stateRoot of block ${last.number}`)
+    need(nodes.used.size === nodes.byHash.size, 'there are nodes of tries that prove nothing')
+
+    // registrations
+    const roots = authorities.map(certificate)
+    const whole = ({ issuer, subject, key, tbs, r, s }) => issuer !== subject || signed(key, tbs, r, s)
+    need(ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
+    let [before, index, hash, revoked] = [0, 0, 0n, false]
+    const signers = events.filter(({ data }) => !data).map((event) => {
+      need(event.previous === before && event.index >= index, 'the registrations do not follow each other')
+      ;[before, index, revoked] = [event.block.number, event.index, Boolean(event.revoked)]
+      if (revoked) return { first: index, block: event.block, why: 'revoked' }
+      hash = big(keccak(event.certificates))
+      try {
+        return { first: index, block: event.block, ...signer(event.certificates, roots, robot, event.block.time) }
+      } catch (error) {
+        if (!(error instanceof Wrong)) throw error
+        return { first: index, block: event.block, why: error.message }
+      }
+    })
+    need(big(word(before)) === changed && hash === certificatesHash && revoked === state.revoked,
+      'the registrations are not those that the contract has')
+
+    // chunks and records
+    const chunks = new Map()
+    const chunkAt = (at) => {
+      const found = written.get(at)
+      need(found, 'no event has this chunk')
+      const chunk = chunkOf(found.chunk)
+      const governing = signers.findLast((one) => one.first <= at)
+      need(governing?.key, `no certificate governs it: ${governing?.why ?? 'none is registered'}`)
+      const form = (purpose) => join(utf8.encode(`rosbridge-eth/2 ${purpose}\0`), log, chunk.encoded)
+      const forms = chunk.bare ? ['dropped', 'chunk'] : ['chunk']
+      need(forms.some((one) => signed(governing.key, form(one), chunk.r, chunk.s)), 'the robot did not sign its chunk')
+      need(chunk.sealed <= governing.until, "its chunk was sealed after the end of the robot's certificate")
+      return { ...chunk, block: found.block }
+    }
+    need(ascending(file.records.map(({ chunk, record }) => chunk * 1000 + record)), 'the records are not in order')
+    const records = file.records.map(({ chunk, record, line, salt, path }) => {
+      try {
+        if (!chunks.has(chunk)) chunks.set(chunk, chunkAt(chunk))
+        const of = chunks.get(chunk)
+        const beside = list(path, 'the hashes of a path').map((one) => unhex(one, 32, 'a hash'))
+        const holds = proven(of.root, of.records, record, unhex(salt, 16, 'a salt'), utf8.encode(line), beside)
+        need(holds, "it is not what the chunk's root commits to")
+        return { chunk, record, line, content: parsed(line), sealed: of.sealed, of, block: of.block }
+      } catch (error) {
+        throw new Wrong(`record ${record} of chunk ${chunk}: ${error.message}`)
+      }
+    })
+    for (const one of signers.filter(({ key }) => key)) {
+      told(`the CA made the robot's certificate ${one.fingerprint}, which holds from chunk ${one.first} on`)
+    }
+    told(`the robot signed the chunk of each record, and the record's path leads to the chunk's root`)
+    return {
+      robot, chain: file.chain_id, genesis: '0x' + file.genesis, contract: '0x' + file.contract, state, blocks, signers,
+      authorities: authorities.map((one) => hex(sm3(one))), records,
+    }
+  }
+
+  return { verify, sm3, keccak, signed, certificate, Wrong, hex, unhex, big }
+})()
+if (typeof module === 'object') module.exports = evidence

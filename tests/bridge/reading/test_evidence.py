@@ -1,0 +1,528 @@
+"""Evidence: what a file shows without a node, and that nothing of it is altered unnoticed; in Python and JavaScript."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rlp
+from eth_utils.crypto import keccak
+from hypothesis import given
+from hypothesis import strategies as st
+
+import geth_network
+from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, odometry, record
+from bridge.reading.world import NAME, START, Pen, authority, message, reader, robot
+from conftest import unavailable
+from ports import free_port
+from rosbridge_eth.chunk import Chunk, content_key
+from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
+from rosbridge_eth.identity import Role, Trust, create_ca, enrol
+from rosbridge_eth.ledger import Ledger, proofs
+from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
+from rosbridge_eth.reading import Choice
+from rosbridge_eth.reading.evidence import MAX_FILE, Evidence, Statement, ask, verify
+from smcrypto import sm3
+from vectors_json import load
+
+JAVASCRIPT = Path(proofs.__file__).parents[1] / "reading" / "evidence.js"
+
+
+def start(*options: str) -> Anvil:
+    try:
+        return Anvil.start(free_port(), options=options)
+    except ChainError as error:
+        unavailable(str(error))
+        raise
+
+
+@pytest.fixture(scope="module")
+def node(require: Callable[[str], str]) -> Iterator[Anvil]:
+    require("npx")
+    with start() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def recorded(node: Anvil) -> Recorded:
+    return record(node)
+
+
+@pytest.fixture(scope="module")
+def one(recorded: Recorded) -> str:
+    """The file of one record."""
+    return recorded.evidence(Choice("/robot_1/odom", at_ns=at(5))).encode()
+
+
+@pytest.fixture(scope="module")
+def span(recorded: Recorded) -> str:
+    """The file of six records in three chunks, under both certificates."""
+    made = recorded.evidence(Choice("/robot_1/odom", from_ns=at(13.8))).encode()
+    assert made.count('"chunk":') == 5
+    return made
+
+
+def check(text: str, roots: Any = ROOTS) -> Statement:
+    return verify(Evidence.read(text.encode()), roots, lambda line: None)
+
+
+@pytest.fixture
+def javascript(require: Callable[[str], str]) -> Callable[[list[str]], list[Any]]:
+    """What evidence.js makes of each text: what it shows, or why it does not hold."""
+    node = require("node")
+    program = f"""
+const evidence = require({str(JAVASCRIPT)!r})
+const plain = (key, value) => (typeof value === 'bigint' ? String(value) : value)
+const answers = JSON.parse(require('fs').readFileSync(0, 'utf8')).map((text) => {{
+  try {{
+    const {{ robot, contract, genesis, chain, state, authorities, records, blocks }} = evidence.verify(text, () => {{}})
+    const lines = records.map((one) => [one.chunk, one.record, one.line, one.sealed, one.block.number])
+    return {{ robot, contract, genesis, chain, state, authorities, lines, blocks: blocks.map((one) => one.hash) }}
+  }} catch (error) {{
+    if (!(error instanceof evidence.Wrong)) throw error
+    return error.message
+  }}
+}})
+process.stdout.write(JSON.stringify(answers, plain))
+"""
+
+    def run(texts: list[str]) -> list[Any]:
+        done = subprocess.run([node, "-e", program], input=json.dumps(texts).encode(), capture_output=True, timeout=120)
+        assert done.returncode == 0, done.stderr.decode()
+        answers: list[Any] = json.loads(done.stdout)
+        return answers
+
+    return run
+
+
+def both(text: str, javascript: Callable[[list[str]], list[Any]]) -> Statement:
+    """What both say of a file that holds: the same."""
+    found, [there] = check(text), javascript([text])
+    assert there == {
+        "robot": found.robot, "contract": found.contract, "genesis": found.genesis, "chain": found.chain_id,
+        "state": {"revoked": found.standing.revoked, "chunks": found.standing.chunks},
+        "authorities": list(found.authorities), "blocks": [block.hash.hex() for block in found.blocks],
+        "lines": [
+            [each.chunk, each.number, each.line.decode(), each.header.sealed_ms, each.block.number]
+            for each in found.records
+        ],
+    }  # fmt: skip
+    return found
+
+
+pytestmark = pytest.mark.service
+
+
+# ---------------------------------------------------------------------- what it shows
+
+
+def test_the_chosen_record_and_no_other_is_shown(recorded: Recorded, one: str, javascript):
+    found = both(one, javascript)
+    assert [each.line for each in found.records] == [odometry(50)]
+    assert found.records[0].as_json() | {"block": 0, "block_time": "", "sealed": "", "digest": ""} == {
+        "chunk": 2, "record": 10, "stream": b"a".hex() * 16, "number": 2, "block": 0, "block_time": "", "sealed": "",
+        "digest": "",
+    }  # fmt: skip
+    assert (found.robot, found.contract, found.chain_id) == (NAME, recorded.ledger.contract.lower(), 31337)
+    assert (found.standing.chunks, found.standing.revoked) == (10, False)
+    assert [each.fingerprint for each in found.certificates] == [
+        sm3.digest(identity.signing_certificate.to_der()).hex() for identity in (robot(), robot(1))
+    ]
+    for text in ("not shown", "/secret", "robot_2", odometry(49).decode()):
+        assert text not in one
+    data = next(iter(recorded.ledger.data_events(recorded.pen.log.tk, 0, recorded.ledger.block_number())))
+    keys = [content_key(Chunk.parse(chunk).header, reader().encryption_key) for chunk in data.chunks]
+    assert not any(key.hex() in one for key in keys)
+
+
+def test_a_span_goes_over_chunks_blocks_and_certificates(span: str, javascript):
+    found = both(span, javascript)
+    assert [each.line for each in found.records] == [odometry(n) for n in (138, 139, 140, 150, 151)]
+    assert [each.chunk for each in found.records] == [6, 6, 7, 8, 9]
+
+
+def test_a_moment_is_the_last_record_of_each_topic(recorded: Recorded, javascript):
+    found = both(recorded.evidence(Choice(at_ns=at(14))).encode(), javascript)
+    assert sorted(each.content.topic for each in found.records) == ["/evil", "/robot_1/odom", "/secret"]
+    [evil] = [each for each in found.records if each.content.topic == "/evil"]
+    assert evil.content.data["text"] == EVIL
+    shown = evil.json_line()
+    assert "\u202e" not in shown and json.loads(shown)["data"] == evil.content.data
+
+
+def test_what_it_proves_and_what_not_is_said_in_words(one: str, span: str):
+    found = check(one)
+    said = " ".join(found.proves())
+    assert "robot_1 signed 1 record as given here" in said and f"block {found.records[0].block.number} " in said
+    assert "not revoked" in said and "if these blocks are the chain's" in said
+    assert "between" in " ".join(check(span).proves())
+    limits = " ".join(found.proves_not())
+    assert "no other records" in limits and "its clock was right" in limits and "--node" in limits
+    assert "--node" not in " ".join(found.proves_not("http://node")) and found.genesis in limits
+
+
+@pytest.mark.parametrize("fork", ["berlin", "shanghai"])
+def test_headers_of_older_forks_have_fewer_fields(fork: str, require, javascript):
+    require("npx")
+    with start("--hardfork", fork) as node:
+        made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+        made.write(made.pen.write(odometry(1)))
+        evidence = made.evidence(Choice("/robot_1/odom"))
+        assert len(proofs.items(evidence.blocks[-1].header)) == {"berlin": 15, "shanghai": 17}[fork]
+        both(evidence.encode(), javascript)
+
+
+def test_on_a_network_with_proof_of_authority(tmp_path: Path, javascript):
+    rich = {key.address: 10**21 for key in (KEYS.operator, KEYS.robot(1))}
+    try:
+        chain = geth_network.Network(tmp_path, rich, nodes=1, period=1)
+    except geth_network.Unavailable as reason:
+        unavailable(str(reason))
+    with chain:
+        made = Recorded(Ledger.deploy(chain.nodes[0].url, KEYS.operator)[0])
+        made.write(made.pen.write(odometry(1), odometry(2)))
+        text = made.evidence(Choice("/robot_1/odom", at_ns=at(0.1))).encode()
+        ask(both(text, javascript), chain.nodes[0].url)
+
+
+def test_a_record_whose_body_is_in_an_archive(node: Anvil, javascript):
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    chunk = made.pen.write(odometry(1), message(at(1), "/image", data="iVBOR" * 20_000), archived=True)
+    made.write(on_chain=[replace(chunk, body=b"").encoded])
+    bodies = {chunk.header.body_digest: chunk.body}
+    text = made.evidence(Choice("/image"), bodies=lambda digest, size: bodies.get(digest)).encode()
+    [shown] = both(text, javascript).records
+    assert shown.content.data["data"] == "iVBOR" * 20_000
+    assert len(text) < 130_000 + 20_000
+
+
+def test_a_revoked_robot_is_said_to_be(node: Anvil, javascript):
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    made.write(made.pen.write(odometry(1)))
+    made.ledger.revoke_robot(KEYS.operator, made.pen.log.tk)
+    found = both(made.evidence(Choice("/robot_1/odom")).encode(), javascript)
+    assert found.standing.revoked and "REVOKED" in " ".join(found.proves())
+
+
+# ---------------------------------------------------------------------- nothing can be altered
+
+
+def altered(value: Any) -> Iterator[tuple[str, Any]]:
+    """Every leaf, list and member changed in a few ways, one at a time; a path for each."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            for where, other in altered(inner):
+                yield f".{name}{where}", value | {name: other}
+            yield f"-{name}", {key: inner for key, inner in value.items() if key != name}
+        yield "+more", value | {"more": 1}
+        yield " reversed", dict(reversed(value.items()))
+    elif isinstance(value, list):
+        for n, inner in enumerate(value):
+            for where, other in altered(inner):
+                yield f"[{n}]{where}", [*value[:n], other, *value[n + 1 :]]
+            yield f"-[{n}]", value[:n] + value[n + 1 :]
+            yield f"+[{n}]", [*value[: n + 1], *value[n:]]
+        if value:
+            yield " emptied", []
+    elif isinstance(value, str):
+        end = len(value)
+        for n in sorted({0, 1, end // 3, end // 2, end - 2, end - 1} & set(range(end))):
+            yield f"@{n}", value[:n] + ("1" if value[n] != "1" else "2") + value[n + 1 :]
+        yield " shorter", value[:-2]
+        yield " longer", value + "00"
+        yield " to a number", 1
+        if value.upper() != value:
+            yield " in capitals", value.upper()
+    else:
+        yield from ((" + 1", value + 1), (" - 1", value - 1), (" as text", str(value)), (" as a double", value + 0.5))
+        yield " to null", None
+
+
+def test_every_leaf_member_and_list_that_is_altered_is_found(span: str, javascript):
+    value = json.loads(span)
+    texts = {where: json.dumps(other, separators=(",", ":")).replace("<", "\\u003c") for where, other in altered(value)}
+    # Another choice of the robot's records is another file, and as good: it says so much less.
+    fewer = {where for where in texts if where.startswith(".records-[")}
+    assert len(fewer) == 5 and len(texts) > 700
+    held = set()
+    for where, text in texts.items():
+        try:
+            assert len(check(text).records) == 4, where
+            held.add(where)
+        except VerificationError:
+            pass
+    assert held == fewer
+    some = sorted({*list(texts)[::4], *fewer})
+    answers = dict(zip(some, javascript([texts[where] for where in some]), strict=True))
+    assert {where for where, answer in answers.items() if not isinstance(answer, str)} == held
+
+
+def test_the_file_has_one_form(one: str, javascript):
+    first, rest = one[: one.index(',"robot"')], one[one.index(',"robot"') :]
+    forms = [
+        one.replace(",", ", ", 1), one.replace('"format"', '"f\\u006frmat"', 1),
+        first + rest.replace('"robot_1"', '"robot\\u005f1"'), first + ',"robot":"robot_2"' + rest,
+        one.replace('"chain_id":31337', '"chain_id":31337.0'), one.replace('"chain_id":31337', '"chain_id":3.1337e4'),
+        one[:-1], one + "x", one + one,
+    ]  # fmt: skip
+    for text in forms:
+        with pytest.raises(VerificationError):
+            check(text)
+    assert all(isinstance(answer, str) for answer in javascript(forms))
+    assert check(f"\n{one}\r\n") == check(one)
+
+
+def test_a_record_is_shown_by_nothing_but_its_own_proof(one: str, javascript):
+    """The attacks of somebody who knows the format: parts of good evidence put together otherwise."""
+    value = json.loads(one)
+
+    def with_record(**changes: Any) -> str:
+        return json.dumps(value | {"records": [value["records"][0] | changes]}, separators=(",", ":"))
+
+    line = value["records"][0]["line"]
+    texts = {
+        "another line": with_record(line=line.replace('"z":0.0', '"z":1.0')),
+        "another salt": with_record(salt="00" * 16),
+        "a node of the tree as a record": with_record(path=value["records"][0]["path"][1:]),
+        "another place": with_record(record=11),
+        "another chunk": with_record(chunk=3),
+        "swapped robot": json.dumps(value | {"robot": "robot_2"}, separators=(",", ":")),
+        "swapped contract": json.dumps(value | {"contract": "11" * 20}, separators=(",", ":")),
+        "swapped chain": json.dumps(value | {"chain_id": 1}, separators=(",", ":")),
+        "no state": json.dumps(value | {"blocks": value["blocks"][:-1]}, separators=(",", ":")),
+        "no registration": json.dumps(value | {"blocks": value["blocks"][1:]}, separators=(",", ":")),
+        "no receipt": json.dumps(value | {"blocks": [{**each, "receipts": []} for each in value["blocks"]]},
+                                 separators=(",", ":")),
+        "a node more": json.dumps(value | {"nodes": [*value["nodes"], "c0"]}, separators=(",", ":")),
+    }  # fmt: skip
+    for what, text in texts.items():
+        with pytest.raises(VerificationError):
+            check(text)
+            pytest.fail(what)
+    assert all(isinstance(answer, str) for answer in javascript(list(texts.values())))
+
+
+def with_hashes(text: str) -> str:
+    """The file with the hashes that its headers have."""
+    value = json.loads(text)
+    for block in value["blocks"]:
+        block["hash"] = keccak(bytes.fromhex(block["header"])).hex()
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def rehung(text: str, old: str, new: str) -> str:
+    """The file with something else in a receipt, and every hash above it made anew: the block is another one then."""
+    value = json.loads(text)
+    nodes = value["nodes"]
+    [n] = [n for n, node in enumerate(nodes) if old in node]
+    assert len(old) == len(new)
+    before = keccak(bytes.fromhex(nodes[n])).hex()
+    nodes[n] = nodes[n].replace(old, new)
+    after = keccak(bytes.fromhex(nodes[n])).hex()
+    hung = json.dumps(value, separators=(",", ":"))
+    if before not in hung:
+        return hung
+    [k] = [k for k, node in enumerate(nodes) if before in node] or [None]
+    if k is not None:
+        return rehung(hung, before, after)
+    return with_hashes(hung.replace(before, after))
+
+
+def test_an_invented_block_does_not_make_a_signature_or_a_storage(one: str, javascript):
+    """Offline nobody can know the chain's blocks; what hangs below them still has to fit, and to be signed."""
+    header = check(one).records[0].header
+    texts = [rehung(one, header.root.hex(), sm3.digest(b"another root").hex()),
+             rehung(one, header.stream.hex() + "0" * 15, "00" * 23 + "0")]
+    for text in texts:
+        assert text != one
+        with pytest.raises(VerificationError, match="does not have the batch"):
+            check(text)
+    assert all("does not have the batch" in answer for answer in javascript(texts))
+
+
+def test_a_block_with_another_hash_is_told_by_the_node_alone(one: str, node: Anvil, javascript):
+    """The limit of what can be known offline: who alters a header and its hash alike shows another block."""
+    value = json.loads(one)
+    _, *fields = proofs.items(bytes.fromhex(value["blocks"][-1]["header"]))
+    value["blocks"][-1]["header"] = rlp.encode([bytes(32), *fields]).hex()
+    found = both(with_hashes(json.dumps(value)), javascript)
+    assert found.blocks[-1].hash != check(one).blocks[-1].hash
+    with pytest.raises(VerificationError, match="another block"):
+        ask(found, node.url)
+
+
+def test_another_ca_is_told(one: str, recorded: Recorded):
+    with pytest.raises(VerificationError, match="another CA"):
+        check(one, [create_ca("Another", at=START).certificate])
+    check(one, [create_ca("Another", at=START).certificate, *ROOTS])
+
+
+OTHER_CA = create_ca("Test CA", at=START)  # the same subject, another key
+
+
+@pytest.mark.parametrize(("ca", "role", "name"), [
+    (OTHER_CA, Role.ROBOT, NAME), (authority(), Role.ROBOT, "robot_3"), (authority(), Role.READER, NAME),
+])  # fmt: skip
+def test_who_is_not_the_robot_by_the_ca_is_refused(ca, role, name, node: Anvil, javascript, monkeypatch):
+    """On the chain all is well: the operator registered these certificates, and their holder wrote."""
+    with monkeypatch.context() as patch:
+        checks = Trust.check
+        patch.setattr(Trust, "check", lambda self, *pair, at, **_: checks(self, *pair, role=tuple(Role), at=at))
+        made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0], Pen(identity=enrol(ca, role, name, at=START)))
+        made.write(made.pen.write(odometry(1)))
+        evidence = made.evidence(Choice("/robot_1/odom"), [ca.certificate])
+    text = evidence.model_copy(update={"authorities": [ROOTS[0].to_der()]}).encode()
+    with pytest.raises(VerificationError, match="no certificate governs it"):
+        check(text)
+    [answer] = javascript([text])
+    assert "no certificate governs it" in answer
+
+
+# ---------------------------------------------------------------------- files from anybody
+
+
+@pytest.mark.parametrize("data", [
+    b"", b"{}", b"[]", b"null", b"[" * 200_000, b'{"a":' * 100_000, b"\xff\xfe", b"<html></html>", b'"' * 9,
+    b"1" * 5_000, b'{"format":"rosbridge-eth evidence 2"}',
+    b'<script type="application/json" id="evidence">{}</script>', b"0" * (MAX_FILE + 1), b'{"format":"\\ud800"}',
+], ids=range(14))  # fmt: skip
+def test_what_is_no_evidence_is_told_in_a_sentence(data: bytes):
+    with pytest.raises(VerificationError) as told:
+        Evidence.read(data)
+    assert len(str(told.value)) < 400 and str(told.value).isprintable()
+
+
+@given(st.binary(max_size=200))
+def test_rlp_is_taken_apart_or_refused(data: bytes):
+    try:
+        parts = proofs.items(data)
+    except VerificationError:
+        return
+    assert rlp.encode([rlp.decode(part) if isinstance(part, proofs.RlpList) else part for part in parts]) == data
+
+
+@given(st.lists(st.recursive(st.binary(max_size=70), lambda inner: st.lists(inner, max_size=6), max_leaves=12)))
+def test_what_rlp_encodes_is_taken_apart(value: Any):
+    def whole(encoded: bytes) -> Any:
+        return [whole(part) if isinstance(part, proofs.RlpList) else part for part in proofs.items(encoded)]
+
+    assert whole(rlp.encode(value)) == value
+
+
+@given(st.binary(max_size=400), st.booleans())
+def test_any_receipt_ends_in_events_or_a_sentence(data: bytes, framed: bool):
+    address, tk = bytes(20), bytes(32)
+    kind = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
+    receipt = rlp.encode([1, 1, bytes(256), [[address, [kind, tk, bytes(32), bytes(32)], data]]]) if framed else data
+    with suppress(VerificationError):
+        assert all(sum(map(len, event.chunks)) <= len(data) for event in proofs.events_of(receipt, address, tk, 1))
+
+
+def test_a_bomb_of_overlapping_chunks_is_refused():
+    """An ABI allows many items of an array to be one and the same; Solidity does not write that."""
+    count, big = 2_000, bytes(60_000)
+    words = [0, 64, count, *[32 * count] * count, len(big)]
+    data = b"".join(word.to_bytes(32) for word in words) + big
+    kind = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
+    receipt = rlp.encode([1, 1, bytes(256), [[bytes(20), [kind, bytes(32), bytes(32), bytes(32)], data]]])
+    with pytest.raises(VerificationError, match="not as Solidity writes it"):
+        list(proofs.events_of(receipt, bytes(20), bytes(32), 1))
+
+
+# ---------------------------------------------------------------------- the node
+
+
+def test_the_chain_is_asked_whether_the_blocks_are_its_own(one: str, recorded: Recorded, node: Anvil, require):
+    found = check(one)
+    ask(found, node.url)
+    last = found.blocks[-1]
+    with pytest.raises(VerificationError, match=f"another block {last.number}"):
+        ask(found._replace(blocks=(*found.blocks[:-1], last._replace(hash=bytes(32)))), node.url)
+    with start("--chain-id", "99") as other, pytest.raises(ChainError, match="another chain"):
+        ask(found, other.url)
+
+
+def test_a_node_that_gives_no_proofs_is_told():
+    chain = EmbeddedChain({KEYS.operator.address: 10**21, KEYS.robot(1).address: 10**18})
+    made = Recorded(Ledger.deploy(chain, KEYS.operator)[0])
+    made.write(made.pen.write(odometry(1)))
+    with pytest.raises(ChainError):
+        made.evidence(Choice("/robot_1/odom"))
+
+
+def test_what_no_file_could_hold_is_refused(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rosbridge_eth.reading.evidence.MAX_FILE", 2**20 + 10_000)
+    with pytest.raises(ConfigError, match="choose fewer"):
+        recorded.evidence(Choice("/robot_1/odom"))
+    monkeypatch.setattr("rosbridge_eth.reading.evidence.MAX_CHOSEN", 3)
+    with pytest.raises(ConfigError, match="choose fewer"):
+        recorded.evidence(Choice("/robot_1/odom"))
+
+
+# ---------------------------------------------------------------------- evidence.js against the standards
+
+
+@pytest.fixture
+def computed(require: Callable[[str], str]) -> Callable[[str, Any], Any]:
+    """What an expression of `evidence` and `given` gives under Node.js."""
+    node = require("node")
+
+    def run(expression: str, given: Any) -> Any:
+        program = f"""
+const evidence = require({str(JAVASCRIPT)!r})
+const given = JSON.parse(require('fs').readFileSync(0, 'utf8'))
+process.stdout.write(JSON.stringify({expression}))
+"""
+        done = subprocess.run([node, "-e", program], input=json.dumps(given).encode(), capture_output=True, timeout=60)
+        assert done.returncode == 0, done.stderr.decode()
+        return json.loads(done.stdout)
+
+    return run
+
+
+def test_sm3_and_keccak_of_any_length(computed):
+    texts = [bytes(n % 251 for n in range(length)).hex() for length in range(300)]
+    both = "[evidence.sm3, evidence.keccak].map((digest) => evidence.hex(digest(evidence.unhex(one))))"
+    made = computed(f"given.map((one) => {both})", texts)
+    assert made == [[sm3.digest(bytes.fromhex(text)).hex(), keccak(bytes.fromhex(text)).hex()] for text in texts]
+
+
+def test_sm3_of_the_standard(computed):
+    vectors = [case.values[0] for case in load("standards/sm3.json")]
+    texts = [each.msg.hex() for each in vectors]
+    made = computed("given.map((one) => evidence.hex(evidence.sm3(evidence.unhex(one))))", texts)
+    assert made == [each.digest.hex() for each in vectors]
+
+
+def test_sm2_signatures_of_the_standard_hold_and_no_other(computed):
+    every = [case.values[0] for case in load("standards/sm2_sign.json", curve="sm2p256v1")]
+    vectors = [each for each in every if each.uid == b"1234567812345678"]
+    assert len(vectors) > 12
+    n = 0xFFFFFFFEFFFFFFFFFFFFFFFFFFFFFFFF7203DF6B21C6052B53BBF40939D54123
+    cases = []
+    for each in vectors:
+        key = each.public_key.hex()
+        r, s = (int.from_bytes(value, "big") for value in (each.r, each.s))
+        bad = [(r ^ 1, s), (r, s ^ 1), (r + n, s), (r, s + n), (0, s), (r, 0), (r, n - r), (s, r)]
+        for good, (a, b) in [(True, (r, s)), *((False, pair) for pair in bad)]:
+            cases.append((good, [key, each.msg.hex(), str(a), str(b)]))
+    made = computed(
+        "given.map(([k, m, r, s]) => evidence.signed(evidence.unhex(k), evidence.unhex(m), BigInt(r), BigInt(s)))",
+        [given for _, given in cases],
+    )
+    assert made == [good for good, _ in cases]
+
+
+def test_a_key_off_the_curve_verifies_nothing(computed):
+    key = "evidence.unhex('04' + '01'.repeat(64))"
+    assert computed(f"[evidence.signed({key}, evidence.unhex('00'), 1n, 1n)]", []) == [False]
+
+
+def test_the_script_knows_the_contracts_code():
+    assert f"const CODE = '{proofs.code_hash().hex()}'" in JAVASCRIPT.read_text()
