@@ -31,6 +31,9 @@ TK, STREAM = robot_id("robot_1"), b"s" * 16
 OPERATOR, READER = ("--passphrase-file", "pass"), ("--passphrase-file", "readers")
 REVOKE = ("revoke", "robot_1", "--compromised", *OPERATOR)
 COMPARE = ("compare", str(sample_bag()), "robot_1", "--topic", "/robot_1/odom", *READER)
+EVIDENCE = ("evidence", "robot_1", "evidence.json", *READER)
+VECTOR = PAGE.parents[1] / "tests" / "vectors" / "evidence"
+VERIFY = ("verify", str(VECTOR / "span.json"), "--ca", str(VECTOR / "ca.crt.pem"))
 CHECK = ("check", "robot_1", STREAM.hex(), "0")
 Given = Callable[[Place, Keyring], object]
 
@@ -124,6 +127,10 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("every message of the bag is on the chain", COMPARE, replayed),
     ("one is missing", COMPARE, lambda place, keys: replayed(place, keys, without=7)),
     ("there is no such bag", ("compare", "none.bag", "robot_1", *READER), replayed),
+    ("no record was chosen", (*EVIDENCE, "--topic", "/other"), replayed),
+    ("the node does not give the proofs", (*EVIDENCE, "--topic", "/robot_1/odom"), replayed),
+    ("all of it holds", VERIFY, as_it_is),
+    ("something does not hold", ("verify", "robot/request.json", *VERIFY[2:]), as_it_is),
     ("shown", ("status",), as_it_is),
     ("the node is on another chain", ("status",), as_it_is),
     ("something is broken", ("doctor",), lambda place, keys: place.path.joinpath("operator").chmod(0o777)),

@@ -23,7 +23,7 @@ from conftest import unavailable
 from ports import free_port
 from rosbridge_eth.chunk import Chunk, content_key
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
-from rosbridge_eth.identity import Role, Trust, create_ca, enrol
+from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
 from rosbridge_eth.ledger import Ledger, proofs
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
 from rosbridge_eth.reading import Choice
@@ -31,6 +31,7 @@ from rosbridge_eth.reading.evidence import MAX_FILE, Evidence, Statement, ask, v
 from smcrypto import sm3
 from vectors_json import load
 
+VECTORS = Path(__file__).resolve().parents[2] / "vectors" / "evidence"
 JAVASCRIPT = Path(proofs.__file__).parents[1] / "reading" / "evidence.js"
 
 
@@ -145,6 +146,15 @@ def test_a_span_goes_over_chunks_blocks_and_certificates(span: str, javascript):
     found = both(span, javascript)
     assert [each.line for each in found.records] == [odometry(n) for n in (138, 139, 140, 150, 151)]
     assert [each.chunk for each in found.records] == [6, 6, 7, 8, 9]
+
+
+def test_the_vector_holds(javascript):
+    """Made by an earlier version: what was given to somebody once can be checked for good."""
+    text = (VECTORS / "span.json").read_text()
+    roots = read_certificates((VECTORS / "ca.crt.pem").read_bytes())
+    found, [there] = check(text, roots), javascript([text])
+    assert [each.line.decode() for each in found.records] == [line for _, _, line, _, _ in there["lines"]]
+    assert [each.line for each in found.records] == [odometry(n) for n in (138, 139, 140, 150, 151)]
 
 
 def test_a_moment_is_the_last_record_of_each_topic(recorded: Recorded, javascript):
