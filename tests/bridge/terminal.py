@@ -22,12 +22,12 @@ SOURCE = Path(__file__).resolve().parents[2] / "src"
 class Terminal:
     """`rosbridge-eth ARGUMENTS` in `folder`, 120 columns wide. `shown` is all it wrote, without colours."""
 
-    def __init__(self, folder: Path, *arguments: str, **environment: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, python: str = sys.executable, **environment: str) -> None:
         ours, theirs = pty.openpty()
         fcntl.ioctl(ours, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 120, 0, 0))
         kept = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "ROSBRIDGE_ETH_"))}
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "rosbridge_eth", *arguments], cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs,
+            [python, "-m", "rosbridge_eth", *arguments], cwd=folder, stdin=theirs, stdout=theirs, stderr=theirs,
             env={**kept, "PYTHONPATH": str(SOURCE), "TERM": "xterm", **environment}, start_new_session=True,
             preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
         )  # fmt: skip

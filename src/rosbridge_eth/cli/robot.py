@@ -98,22 +98,27 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
         with closing(everything(config)) as opened:
             offers = offered(opened)
         topics = sorted({offer.topic for offer in offers} - PLUMBING)
-        if asks:
+        if asks and offers:
             topics = _choose(offers, topics)
     if not topics:
         raise ConfigError(f"{source} offers no topics now: name them with --topic, or start what publishes them")
-    return robot_toml(topics, source)
+    made = robot_toml(topics, source)
+    parse_config(RobotConfig, made, place.config)  # what was typed may be no name
+    return made
 
 
 def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
     numbered = {str(number): offer for number, offer in enumerate(offers, 1)}
     rows = [(number, offer.topic, offer.type_name) for number, offer in numbered.items()]
     errors.print(table("Topics", ["", "topic", "type"], rows, right=[0]))
-    given = str(typer.prompt("Which, by number, name or pattern", default="all", err=True))
-    if given == "all":
-        return suggested
-    words = re.split("[ ,]+", given.strip())
-    return list(dict.fromkeys(numbered[word].topic if word in numbered else word for word in words))
+    while True:
+        given = str(typer.prompt("Which, by number, name or pattern", default="all", err=True))
+        words = re.split("[ ,]+", given.strip())
+        if none := [word for word in words if word.isdigit() and word not in numbered]:
+            talk(f"There is no number {none[0]}.")
+            continue
+        chosen = (numbered[word].topic if word in numbered else word for word in words)
+        return suggested if given == "all" else [*dict.fromkeys(chosen)]
 
 
 def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> None:

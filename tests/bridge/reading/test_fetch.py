@@ -120,7 +120,7 @@ def test_confirmations_leave_the_newest_blocks_for_later(chain):
 
 def test_a_block_from_before_the_contract_is_told_in_a_sentence(chain):
     chain.write(chain.pen.chunks(1))
-    with pytest.raises(ChainError, match="no contract 0x.* yet in block 0 of .*fewer confirmations"):
+    with pytest.raises(ChainError, match=r"no contract 0x.* yet in block 0 of .*fewer confirmations"):
         chain.read(confirmations=100)
 
 

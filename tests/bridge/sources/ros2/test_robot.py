@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import socket
@@ -12,6 +13,9 @@ import pytest
 
 from bridge.lone_robot import chunks_of, command, lines_of, lone_robot
 from bridge.sources.ros2.graph import Graph
+from bridge.terminal import Terminal
+from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.home import RobotHome
 
 pytestmark = pytest.mark.service
@@ -56,3 +60,42 @@ def test_a_robot_without_rclpy_says_what_to_do(robot: RobotHome, ros: Graph, tmp
         "a ROS 2 source needs rclpy, which this Python does not have; start the robot in an environment where" in told
     )
     assert "Traceback" not in told
+
+
+def test_topics_and_join_show_the_live_graph(ros: Graph, python: str, tmp_path: Path):
+    node = ros.node("/robot_1/base")
+    node.order(create="/robot_1/odom", type="nav_msgs/msg/Odometry", depth=100)
+    node.order(create="/status", type="std_msgs/msg/String", depth=10)
+    here = {name: text for name, text in ros.environment.items() if name.startswith("ROS_")}
+    listing = ros.program(["-m", "rosbridge_eth", "topics", "--source", "ros2", "--seconds", "3", "--json"])
+    node.order(**{"await": "/robot_1/odom"})
+    node.order(burst="/robot_1/odom", count=20, rate=50)
+    assert listing.finish() == 0, listing.errors
+    found = {each["topic"]: each for each in json.loads(listing.lines[0])["topics"]}
+    odom = found["/robot_1/odom"]
+    assert (odom["type"], odom["nodes"], odom["messages"]) == ("nav_msgs/msg/Odometry", ["/robot_1/base"], 20)
+    assert odom["rate"] == pytest.approx(50, rel=0.5) and found["/status"]["messages"] == 0
+    (tmp_path / "word").write_text("word")
+    with Terminal(tmp_path, "join", "--password-file", "word", python=python, **here) as join:
+        join.answer("Name of this robot", "")
+        join.answer("Messages come from", "ros2")
+        numbers = dict(re.findall(r"(\d+) [^\w/]*(/\S+)", join.until("Which, by number, name or pattern")))
+        [status] = [number for number, topic in numbers.items() if topic == "/status"]
+        join.type("99")
+        join.until("There is no number 99.")
+        join.answer("Which, by number, name or pattern", f"{status} /robot_1/*")
+        join.until("rosbridge-eth register robot_1 robot/request.json")
+        assert join.end() == 0
+    config = load_robot_config(tmp_path / "robot" / "robot.toml")
+    assert [topic.topic for topic in config.topics] == ["/status", "/robot_1/*"]
+    assert config.source is not None and config.source.kind == "ros2"
+
+
+def test_a_graph_without_topics_is_no_choice(ros: Graph, python: str, tmp_path: Path):
+    (tmp_path / "word").write_text("word")
+    here = {name: text for name, text in ros.environment.items() if name.startswith("ROS_")}
+    with Terminal(tmp_path, "join", "--password-file", "word", "--source", "ros2", python=python, **here) as join:
+        join.answer("Name of this robot", "")
+        join.until("ros2 offers no topics now: name them with --topic")
+        assert join.end() == ExitCode.CONFIG
+    assert not (tmp_path / "robot").exists()
