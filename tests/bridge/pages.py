@@ -31,7 +31,7 @@ def script_of(page: str, marked: str = "") -> tuple[str, list[str]]:
     for language, mark, text in _FENCE.findall((ROOT / "docs" / page).read_text(encoding="utf-8")):
         if language == "sh" and mark == marked:
             commands.append(text)
-        elif language == "text" and not mark:
+        elif language == "text" and mark == marked:
             says += text.splitlines()
         elif language in ("toml", "conf") and mark:
             into = mark if mark.startswith(">>") else f"> {mark}"

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import socket
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -21,9 +22,10 @@ from ports import free_port
 from rosbridge_eth import administration as admin
 from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.config import load_robot_config, load_server_config
+from rosbridge_eth.errors import ChainError
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
-from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.sources import sample_bag
 from rosbridge_eth.supervisor import open_store
@@ -33,9 +35,9 @@ WORDS = {"operator": "an operator's passphrase", "reader": "the owner's passphra
 
 
 PATRON = """
-import json, pathlib, time
+import json, pathlib, sys, time
 from urllib.request import Request, urlopen
-accounts = pathlib.Path("/var/lib/rosbridge-eth/operator/accounts.json")
+accounts = pathlib.Path(sys.argv[1])
 while not accounts.exists():
     time.sleep(0.2)
 account = json.loads(accounts.read_text())["operator"]
@@ -185,11 +187,41 @@ python3() {{  # stands for what README.md's first command does in every run: an 
 }}
 systemctl() {{ {sys.executable} {ROOT}/tests/bridge/service.py "$@"; }}
 journalctl() {{ cat /etc/journal; }}
-{sys.executable} {patron} &
+{sys.executable} {patron} /var/lib/rosbridge-eth/operator/accounts.json &
 """
     ports = {"8545": int(anvil.url.rpartition(":")[2]), "7410": free_port(socket.SOCK_DGRAM)}
     type_page("operations.md", checkout, ports=ports, before=before, shell=("unshare", "--mount", "bash"),
               typed="an operator's passphrase\n")  # fmt: skip
+
+
+def test_another_operator_takes_over(place: Path, made: tuple[Path, Anvil], require: Callable[[str], str]):
+    require("jq")
+    anvil = made[1]
+    (patron := place / "patron.py").write_text(PATRON.format(anvil.url))
+    (place / "secrets" / "new").write_text("the new operator's passphrase\n")
+    ledger = Ledger.connect(anvil.url, OperatorHome(place / "operator").deployment())
+    before = ledger.operator()
+    ports = {"8545": int(anvil.url.rpartition(":")[2]), "7410": free_port(socket.SOCK_DGRAM)}
+    type_page("operations.md", place, ports=ports, marked="handover",
+              before=f"{sys.executable} {patron} new/accounts.json &")
+    assert before != ledger.operator() == OperatorHome(place / "new").account
+    with pytest.raises(ChainError, match="NotOperator"):
+        keys = Keyring.load(OperatorHome(place / "operator").accounts, WORDS["operator"].encode())
+        ledger.transact(keys.operator, "offerOperator", before)
+    ledger.close()
+    (place / "robot/robot.toml").write_text(
+        'topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\nduration = "5s"\nspeed = "max"\n'
+    )
+    script = """
+export PATH="$PWD/.programs:$PATH"
+rosbridge-eth server --home new --passphrase-file secrets/new 2> server.log &
+trap 'kill %1' EXIT
+until grep -q Listening server.log; do sleep 0.2; done
+rosbridge-eth robot
+until rosbridge-eth read robot_1 --home new-reader > read.jsonl; grep -q odom read.jsonl; do sleep 1; done
+"""
+    subprocess.run(["bash", "-euc", script], cwd=place, check=True, timeout=120)
+    assert (place / "read.jsonl").read_text().count('"topic":"/robot_1/odom"') == 50
 
 
 def test_a_fleets_ca_is_the_bridges(tmp_path: Path):

@@ -45,6 +45,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command()(renew)
     app.command(epilog="Example: rosbridge-eth export robot_1 keystore.json")(export)
     app.command()(mnemonic)
+    app.command(epilog="Example: rosbridge-eth handover 0x5aAe…; rosbridge-eth handover --home new")(handover)
     app.command(epilog="Example: rosbridge-eth backup copy-of-operator")(backup)
     app.command(epilog="Example: rosbridge-eth passwd --home robot")(passwd)
     app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
@@ -353,6 +354,28 @@ def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: Passphra
     if words is None:
         raise IdentityError("the accounts of this home come from a seed, not from words")
     typer.echo(words)
+
+
+def handover(
+    to: Annotated[str | None, typer.Argument(help="The account of the operator's home that takes over.")] = None,
+    home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
+) -> None:  # fmt: skip
+    """Offer the contract to another operator's account; without an account, take over what is offered to this home's.
+
+    Until it is taken over nothing changes, and another offer replaces this one. docs/operations.md has all steps.
+    """
+    from eth_utils.address import is_address, to_checksum_address
+
+    if to is not None and not is_address(to):
+        raise ConfigError(f"{to!r} is no account's address; `status` of the other home shows it")
+    place, _, keys = _opened(home, passphrase_file)
+    with ledger_of(place) as ledger:
+        if to is not None:
+            ledger.transact(keys.operator, "offerOperator", to_checksum_address(to))
+            talk(f"{ledger.contract} is offered to {to}; it changes hands when that home runs `handover`.")
+        else:
+            ledger.transact(keys.operator, "acceptOperator")
+            talk(f"{keys.operator.address} is the operator of {ledger.contract}. Register each robot with --replace.")
 
 
 def backup(
