@@ -124,7 +124,7 @@ def measure(quick: bool) -> dict[str, Any]:
         operator = load.Operator(Path(folder), "anvil", "sqlite", counts[-1], lambda text: None)
         try:
             for count in counts:
-                runs.append(load.run(operator, count, messages, per_chunk=per_chunk))
+                runs.append(load.run(operator, count, messages, per_chunk=per_chunk, limit=1200.0))
         finally:
             operator.close()
     first = runs[0]
