@@ -33,6 +33,7 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
     reader.toml          the ledger, the nodes, and where the rest is
     *.key.pem *.crt.pem  its keys, under its own passphrase, its certificates, and the CA's
     public.pem           its two certificates, for robots that shall seal for it
+    grants/              what other readers granted to it
 """
 
 from __future__ import annotations
@@ -259,6 +260,7 @@ class ReaderHome:
         self.path = path
         self.config = path / "reader.toml"
         self.public = path / "public.pem"
+        self.grants = path / "grants"
 
     def require(self) -> ReaderHome:
         """This home, if it is a reader's; else ConfigError."""

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from bridge.pages import ROOT, type_page
 from bridge.sources.ros2.graph import free_domain, ros2_python
@@ -134,6 +135,23 @@ redis-server() {{ command redis-server "$@" --port {port}; }}
 """,
     )
     assert "PASSWORD" not in said
+
+
+def test_watch(place: Path, require: Callable[[str], str]):
+    """Typed, and looked at: the file has its index, and who was granted a span has its records."""
+    require("curl")
+    type_page(
+        "howto-watch.md", place, ports={"8080": free_port()},
+        before="rosbridge-eth server 2> server.log &\nuntil grep -q Listening server.log; do sleep 0.2; done\n"
+        "set -m; disown",
+    )
+    assert "<title>Robots, as proven from the chain</title>" in (place / "page.html").read_text()
+    with (place / "watched.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and summary.statistics is not None and summary.statistics.message_count == 50
+    assert [schema.encoding for schema in summary.schemas.values()] == ["ros2msg"] * len(summary.schemas)
+    granted = [json.loads(line) for line in (place / "granted.jsonl").read_text().splitlines()]
+    assert len(granted) == 50 and {record["topic"] for record in granted} == {"/robot_1/odom"}
 
 
 def test_poa(place: Path, require: Callable[[str], str]):

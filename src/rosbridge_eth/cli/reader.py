@@ -7,13 +7,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
-from datetime import datetime
-from functools import partial
+from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import typer
 
@@ -25,6 +24,7 @@ from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
 
 if TYPE_CHECKING:
+    from rosbridge_eth.identity import Identity, Trust
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading
 
@@ -34,6 +34,10 @@ def add_commands(app: typer.Typer) -> None:
         epilog="Examples: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl;"
         " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
     )(read)
+    app.command(
+        epilog="Example: rosbridge-eth grant robot_1 --from 2026-11-21T10:00:00Z --to 2026-11-21T10:05:00Z"
+        " --reader insurer.pem"
+    )(grant)
     app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
     app.command(epilog="Example: rosbridge-eth evidence robot_1 crash.html --at 2026-11-21T10:00:00Z")(evidence)
     app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
@@ -64,6 +68,17 @@ def _time(text: str | None) -> int | None:
         return None if text is None else parse_time(datetime.fromisoformat(text))
     except ValueError as error:
         raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
+
+
+def _choice(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
+    from rosbridge_eth.reading import Choice
+
+    choice = Choice(topic, _time(from_), _time(to), _time(at))
+    if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
+        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
+    if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
+        raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
+    return choice
 
 
 def _address(text: str | None) -> Address | None:
@@ -292,40 +307,105 @@ def verify(
         talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
 
 
+class _Asked(NamedTuple):
+    """Who reads, with what. read: `read_robot` that wants to know only whose log, when, and behind what."""
+
+    identity: Identity
+    trust: Trust
+    ledgers: Sequence[Ledger]
+    bookmarks: Bookmarks
+    read: Callable[..., Reading]
+
+
 @contextmanager
 def _asking(
     place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
-) -> Iterator[tuple[Sequence[Ledger], Bookmarks, Callable[..., Reading]]]:
-    """The nodes, the bookmarks, and `read_robot` that wants to know only whose log, when, and behind what."""
+) -> Iterator[_Asked]:
     from rosbridge_eth.identity import Trust, load_identity
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading import Bookmarks, read_robot
+    from rosbridge_eth.reading.grant import open_folder
 
     config = load_reader_config(place.config)
     identity, roots = load_identity(config.identity, read_passphrase("reader", "Passphrase of the reader", file=file))
+    trust = Trust(roots)
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
     bookmarks = Bookmarks(place.path / "bookmarks.json")
+    granted = open_folder(place.grants, ledger=config.ledger, reader=identity, trust=trust)
+
+    def read(robot: str, **more: Any) -> Reading:
+        return read_robot(
+            ledgers, robot, trust=trust, reader=identity.encryption_key, bookmarks=bookmarks,
+            granted=granted.get(robot), cache=place.path / "proven", confirmations=confirmations, **more,
+        )  # fmt: skip
+
     with ExitStack() as stack:
         for ledger in ledgers:
             stack.callback(ledger.close)
-        yield ledgers, bookmarks, partial(
-            read_robot, ledgers, trust=Trust(roots), reader=identity.encryption_key, bookmarks=bookmarks,
-            cache=place.path / "proven", confirmations=confirmations,
+        yield _Asked(identity, trust, ledgers, bookmarks, read)
+
+
+def grant(
+    robot: RobotName,
+    from_: Annotated[str, typer.Option("--from", help="Chunks that hold a message received from this time on,")],
+    to: Annotated[str, typer.Option(help="and before this time. Everything in these chunks is opened.")],
+    reader: Annotated[str, typer.Option(help="For whom: that reader's public.pem, or NAME for readers/NAME.pem.")],
+    out: Annotated[Path | None, typer.Option(help="The file to write; ROBOT-NAME.grant without it.")] = None,
+    home: ReaderHomeOption = READER_HOME,
+    node: Nodes = None,
+    confirmations: Confirmations = 1,
+    confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None,
+) -> None:
+    """Hand the keys of a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
+
+    They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
+    """
+    from rosbridge_eth.files import write_atomically
+    from rosbridge_eth.identity import Role, public_identity
+    from rosbridge_eth.reading import grant as granting
+
+    choice, place = _choice(None, from_, to, None), ReaderHome(home).require()
+    known = place.path / "readers" / f"{reader}.pem"
+    peer = public_identity(read_given(known if known.exists() else Path(reader)))
+    now = datetime.now(UTC)
+    with _asking(place, node, confirmations, passphrase_file) as asked:
+        certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
+        peer = asked.trust.check(*certificates, role=Role.READER, at=now)
+        out = out or Path(f"{robot}-{peer.name}.grant")
+        if out.exists():
+            raise ConfigError(f"{out} is there already; name another with --out")
+        with _reading_as(asked, robot, confirm) as (reading, said):
+            keys = granting.keys_of(reading, choice)
+        if not keys:
+            raise ConfigError(f"this reader can open nothing of {robot} that was received in that time; see above")
+        made = granting.make(
+            keys, ledger=reading.verifier.log.ledger, robot=robot, begin=from_, end=to, by=asked.identity, to=peer,
+            now=now,
         )  # fmt: skip
+    write_atomically(out, made, new=True)
+    chunks = f"{len(keys):,} chunk{'s' * (len(keys) > 1)}"
+    talk(f"{out} opens {chunks} of {robot} for reader {peer.name}, and for nobody else.")
+    talk(f"Whoever has {peer.name}'s home puts it into `grants/` there and runs: rosbridge-eth read {robot}")
+    _require_sound(place, robot, said)
 
 
 @contextmanager
 def _reading(
     place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int, confirm: bool, file: Path | None
 ) -> Iterator[tuple[Reading, dict[str, Any]]]:
+    with _asking(place, nodes, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
+        yield found
+
+
+@contextmanager
+def _reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
     """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
     said = dict[str, Any]()
-    with _asking(place, nodes, confirmations, file) as (_, bookmarks, read), ExitStack() as stack:
-        reading = read(robot, now=time.time())
-        stack.callback(reading.close)
+    with closing(asked.read(robot, now=time.time())) as reading:
         yield reading, said
         verdict = reading.verdict()
-    reading.keep(bookmarks, confirm=confirm)
+    reading.keep(asked.bookmarks, confirm=confirm)
     said |= verdict.as_json()
     for line in verdict.lines():
         talk(line)
@@ -344,9 +424,10 @@ def _following(
     from rosbridge_eth.reading.live import Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with _asking(place, nodes, confirmations, file) as (ledgers, bookmarks, read), ExitStack() as stack:
-        following = Following([Followed(name, read, bookmarks, confirm=confirm) for name in robots], ledgers)
-        view = View([ledger.url for ledger in ledgers], confirmations, robots)
+    with _asking(place, nodes, confirmations, file) as asked, ExitStack() as stack:
+        followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
+        following = Following(followed, asked.ledgers)
+        view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)
         if address is not None:
             page = Page(address, view)
             stack.callback(page.close)

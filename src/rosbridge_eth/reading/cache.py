@@ -19,7 +19,7 @@ import secrets
 import sqlite3
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
@@ -199,10 +199,16 @@ class Cache:
             raise StoreError(f"{self._path} is damaged; remove it and read again") from error
 
 
-def open_cache(folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust: Trust) -> Cache | None:
-    """What this reader has proven of the robot on this ledger under these CAs; None where nothing can be kept."""
+def open_cache(
+    folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust: Trust, granted: Mapping[bytes, bytes]
+) -> Cache | None:
+    """What this reader has proven of the robot on this ledger under these CAs; None where nothing can be kept.
+
+    granted: keys that were handed over; with others, the file is begun anew.
+    """
     roots = sm3.digest(b"".join(root.to_der() for root in trust.roots))
-    key = sm3.hmac(reader.to_bytes(), b"rosbridge-eth/2 what is proven" + log_.ledger + log_.tk + roots)[:16]
+    given = b"".join(digest + key for digest, key in sorted(granted.items()))
+    key = sm3.hmac(reader.to_bytes(), b"rosbridge-eth/2 what is proven" + log_.ledger + log_.tk + roots + given)[:16]
     path = folder / f"{name}.sqlite"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -35,7 +35,6 @@ from rosbridge_eth.chunk import (
     Log,
     Proof,
     check_proof,
-    content_key,
     ledger_id,
     open_lines,
     proofs,
@@ -424,8 +423,6 @@ def _holds(event: DataEvent, chunks: Iterable[int]) -> bool:
 
 def _proven(reading: Reading, records: Sequence[ProvenRecord], data: Iterable[DataEvent]) -> Iterator[Record]:
     """Each record with its way up to the root: for that its chunk is opened once more, with all its lines."""
-    if reading.reader is None:
-        raise ValueError("who reads without a key has no records")
     numbers = defaultdict[int, set[int]](set)
     for record in records:
         numbers[record.place.chunk].add(record.number)
@@ -436,7 +433,7 @@ def _proven(reading: Reading, records: Sequence[ProvenRecord], data: Iterable[Da
                 if chunk.bare and reading.bodies is not None:
                     body = reading.bodies(chunk.header.body_digest, chunk.header.body_length)
                     chunk = replace(chunk, body=body or b"")
-                key = content_key(chunk.header, reading.reader)
+                key = reading.verifier.key_of(chunk.header)
                 lines = open_lines(reading.verifier.log, chunk, key)
                 for one in proofs(lines, key, sorted(numbers[index])):
                     line = lines[one.index].decode()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ MARGIN = 128
 class Reading:
     """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
 
-    top: the block up to which is read. ledger: on the node that is read. reader, trust, bodies: of who reads. kept: of
+    top: the block up to which is read. ledger: on the node that is read. trust, bodies: of who reads. kept: of
     earlier readings; `chunks` are those behind it. topics: that were read so far.
     """
 
@@ -35,7 +35,6 @@ class Reading:
     nodes: Sequence[str]
     top: Block
     ledger: Ledger
-    reader: sm2.PrivateKey | None
     trust: Trust
     bodies: Bodies | None = None
     kept: Cache | None = None
@@ -73,13 +72,14 @@ def read_robot(
     ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
     bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
     heartbeat: float = HEARTBEAT, bodies: Bodies | None = None, before: Reading | None = None,
+    granted: Mapping[bytes, bytes] | None = None,
 ) -> Reading:  # fmt: skip
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
     ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next
     reading asks only for what is new. confirmations: read up to the block that has so many, itself counted. bodies: of
-    archived chunks, see Verifier. before: a reading that came to its end; this one goes on behind it if the chain is
-    the same up to there, and keeps nothing. Raises ChainError; ConfigError for nodes of different ledgers;
+    archived chunks, and granted: see Verifier. before: a reading that came to its end; this one goes on behind it if
+    the chain is the same up to there, and keeps nothing. Raises ChainError; ConfigError for nodes of different ledgers;
     IdentityError for a name that the contract does not know.
     """
     tk = robot_id(check_name(name))
@@ -100,13 +100,14 @@ def read_robot(
         at, links, next_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
     elif cache is not None and reader is not None:
         file = f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}"
-        kept = _kept(cache, file, log, reader, trust, ledger, block, told)
+        kept = _kept(cache, file, log, reader, trust, granted or {}, ledger, block, told)
         if kept is not None:
             at, links, next_block = kept.progress, kept.links, kept.next_block
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
         block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, heartbeat=heartbeat,
         elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), bodies=bodies,
+        granted=granted,
     )  # fmt: skip
     first_block = max(registrations[0].block if registrations else 0, next_block)
     events = ledger.data_events(tk, first_block, standing.data_block)
@@ -114,7 +115,7 @@ def read_robot(
         chunks = verifier.read(events)
     else:
         chunks = _keeping(kept, verifier, events, ledger.block(max(0, block - MARGIN)))
-    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, reader, trust, bodies, kept)
+    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, trust, bodies, kept)
 
 
 def _still_there(ledger: Ledger, seen: Block, block: int) -> bool:
@@ -122,10 +123,11 @@ def _still_there(ledger: Ledger, seen: Block, block: int) -> bool:
 
 
 def _kept(
-    folder: Path, name: str, log: Log, reader: sm2.PrivateKey, trust: Trust, ledger: Ledger, block: int, told: list[str]
+    folder: Path, name: str, log: Log, reader: sm2.PrivateKey, trust: Trust, granted: Mapping[bytes, bytes],
+    ledger: Ledger, block: int, told: list[str],
 ) -> Cache | None:
     """What earlier readings have proven, if the chain up to there is the same; empty if it is another one."""
-    kept = open_cache(folder, name, log, reader, trust)
+    kept = open_cache(folder, name, log, reader, trust, granted)
     if kept is None or kept.block == 0 or (kept.block <= block and ledger.block(kept.block).hash == kept.hash):
         return kept
     if kept.block <= block:

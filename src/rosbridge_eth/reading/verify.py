@@ -8,7 +8,7 @@ messages, and the findings, of which so many are kept. docs/reading.md has the o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -126,7 +126,8 @@ class Verifier:
     standing: of the robot, at the block up to which is read. registrations: all of them, oldest first.
     reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
     bodies: of an archived chunk's body, by its digest and length, what the archive has, None where it has nothing;
-    without it archived records are told and not opened.
+    without it archived records are told and not opened. granted: by a chunk's digest, the content key that another
+    reader handed over.
     at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
     now, heartbeat: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
     may have chunks of this robot.
@@ -137,9 +138,10 @@ class Verifier:
         trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
         mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
         heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None,
+        granted: Mapping[bytes, bytes] | None = None,
     ) -> None:  # fmt: skip
         self.name, self.log = name, Log(ledger, robot_id(name))
-        self._bodies = bodies
+        self._bodies, self._granted = bodies, granted or {}
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
@@ -336,18 +338,29 @@ class Verifier:
 
     # --- content
 
+    def key_of(self, header: Header) -> bytes:
+        """The content key, for this reader on the chain or handed over to it; NoGrant, Unopenable."""
+        try:
+            if self._reader is None:
+                raise NoGrant(f"{header} is opened with a reader's key")
+            return content_key(header, self._reader)
+        except NoGrant:
+            if header.digest not in self._granted:
+                raise
+            return self._granted[header.digest]
+
     def _open(self, place: Place, chunk: Chunk) -> ProvenChunk:
-        count = chunk.header.records
+        count, key = chunk.header.records, b""
         if not count:
             return ProvenChunk(place, chunk, b"", (), ())
-        if self._reader is None:
-            raise _Refused(Kind.NO_GRANT, count=count)
         try:
-            key = content_key(chunk.header, self._reader)
+            key = self.key_of(chunk.header)
             lines = open_lines(self.log, chunk, key)
         except NoGrant:
             raise _Refused(Kind.NO_GRANT, count=count) from None
         except Unopenable as error:
+            if key and key == self._granted.get(place.digest):  # who gave it could open the chunk
+                raise VerificationError(f"a wrong key was granted for {chunk.header}: remove that grant") from None
             raise _Refused(Kind.UNOPENABLE, shown(str(error))) from None
         records = tuple(self._parsed(place, lines, MAX_ARCHIVED_LINE if chunk.header.archived else MAX_LINE))
         self._at.records += len(records)
