@@ -88,17 +88,6 @@ def _address(text: str | None) -> Address | None:
         raise typer.BadParameter(f"{text!r}: write a port, or HOST:PORT", param_hint="--serve") from error
 
 
-def _choice(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
-    from rosbridge_eth.reading import Choice
-
-    choice = Choice(topic, _time(from_), _time(to), _time(at))
-    if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
-        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
-    if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
-        raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
-    return choice
-
-
 def read(
     robot: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="The robot's name; several with --serve.")],
     home: ReaderHomeOption = READER_HOME,
