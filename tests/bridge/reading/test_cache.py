@@ -298,7 +298,8 @@ def test_a_full_disk_ends_the_keeping_and_not_the_reading(chain, tmp_path, caplo
         assert numbers(read(chain, tmp_path)[0]) == list(range(40))
     assert "disk is full" in caplog.text
     assert numbers(read(chain, tmp_path)[0]) == list(range(40))
-    assert caching.open_cache(tmp_path / "proven", NAME, LOG, reader().encryption_key, Trust([authority().certificate]))
+    trust = Trust([authority().certificate])
+    assert caching.open_cache(tmp_path / "proven", NAME, LOG, reader().encryption_key, trust, {})
 
 
 def test_of_endlessly_many_topics_some_are_remembered(tmp_path, monkeypatch):
