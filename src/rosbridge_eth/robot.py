@@ -99,7 +99,8 @@ class Robot:
 
     def fire(self, why: str, name: str | None = None) -> None:
         """An event of this trigger, or of all, by hand; to be called in the loop's thread."""
-        self.box.fire(time.time_ns() if self.source.live else self.box.newest_ns, why, name)
+        replayed = 0 if self.source.live else self.box.newest_ns
+        self.box.fire(replayed or time.time_ns(), why, name)
 
     @property
     def lost(self) -> dict[tuple[str, str], int]:

@@ -286,7 +286,8 @@ def _robot(place: RobotHome) -> Report:
                 report["spool"] = spool.statistics()._asdict()
         except InUse:
             report["runs"] = True
-            wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped")
+            wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
+                      "trigger_records")  # fmt: skip
             report["figures"] = {
                 " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
                 for name, labels, value in _running(report, place.path, ["robot"], "robot") if name in wanted

@@ -252,6 +252,16 @@ def test_a_condition_that_can_never_hold_is_told(text: str, says: str, caplog: p
     assert [says in record.getMessage() for record in caplog.records if record.levelno == logging.ERROR] == [True]
 
 
+def test_the_message_that_is_the_event_is_written_with_what_came_before_it():
+    box = BlackBox([TriggerRule("crash", S, S, 1 << 20, (Condition.parse("/all number > 4"),))])
+    for number in range(6):
+        message = raw({"number": number})._replace(received_ns=START + number)
+        box.look(message)
+        box.keep("crash", Record("/all", START + number, b"%d" % number, DEFINITIONS[0]))
+    assert [record.line for record in box.released if record.definition] == [b"0", b"1", b"2", b"3", b"4", b"5"]
+    assert not box.released[0].definition, "the line that says why comes first"
+
+
 def test_a_message_that_cannot_be_decoded_is_no_event():
     box = BlackBox([TriggerRule("crash", S, S, 1 << 20, (Condition.parse("/all ok == true"),))])
     box.look(raw({})._replace(raw=b"\x01"))

@@ -263,7 +263,7 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
             for topic in sorted({*running.written, *lost})]  # fmt: skip
     kept = [
         f"Trigger {each.rule.name}: {len(each.ring)} records in memory, {each.ring.bytes / 2**20:.1f} of"
-        f" {each.rule.memory / 2**20:.1f} MiB; {each.fired} events." for each in running.box.triggers.values()
+        f" {each.rule.memory / 2**20:.1f} MiB; events: {each.fired}." for each in running.box.triggers.values()
     ]
     spool, sender = running.spool.statistics(), running.sender.statistics
     newest = sender.newest
