@@ -59,10 +59,11 @@ def utc_now() -> datetime:
     return datetime.now(UTC)
 
 
-def read_given(path: Path) -> bytes:
-    """A file that was named on the command line; ConfigError."""
+def read_given(path: Path, limit: int = -1) -> bytes:
+    """A file that was named on the command line, or so many bytes of it; ConfigError."""
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(limit)
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
 

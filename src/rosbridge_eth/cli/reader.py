@@ -275,7 +275,7 @@ def verify(
     from rosbridge_eth.identity import read_certificates
     from rosbridge_eth.reading import evidence as checking
 
-    data = read_given(file)
+    data = read_given(file, checking.MAX_FILE + 1)
     given = checking.Evidence.read(data)
     found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
     if node is not None:

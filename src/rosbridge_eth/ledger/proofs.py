@@ -32,6 +32,8 @@ HEADER: Final = (
     "*baseFeePerGas", "withdrawalsRoot", "*blobGasUsed", "*excessBlobGas", "parentBeaconBlockRoot", "requestsHash",
 )  # fmt: skip
 _BEFORE_LONDON: Final = 15
+#: Bytes of a node, 17 hashes and their RLP. What is larger is a leaf, and nobody has us read that again and again.
+_LARGEST_BRANCH: Final = 3 + 17 * 33
 _ROBOTS, _BATCH = 2, 4  # slots of RobotLedger.sol
 _DATA = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
 _REGISTERED = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
@@ -125,6 +127,8 @@ class Nodes(dict[bytes, bytes]):
     def _node(self, digest: bytes, what: str) -> bytes:
         if digest not in self:
             raise VerificationError(f"the proof of {what} does not hold: a node of its trie is missing")
+        if digest in self.used and len(self[digest]) > _LARGEST_BRANCH:
+            raise VerificationError(f"the proof of {what} has the leaf of another")
         self.used[digest] = self[digest]
         return self[digest]
 
@@ -267,14 +271,17 @@ def header_of(ledger: Ledger, number: int) -> tuple[Header, list[str]]:
 
 
 def prove_receipts(ledger: Ledger, header: Header, transactions: Sequence[str]) -> tuple[list[bytes], Nodes]:
-    """The block's receipts and their trie. ChainError where that does not have the header's root."""
+    """The receipts of these transactions, all of the block's or none, and their trie.
+
+    ChainError where that does not have the header's root.
+    """
     asked = [("eth_getTransactionReceipt", [each]) for each in transactions]
     receipts = ledger.ask(asked, lambda answers: [_receipt(answer) for answer in answers])
     nodes = Nodes()
     trie = HexaryTrie(nodes)
     for index, receipt in enumerate(receipts):
         trie[rlp.encode(index)] = receipt
-    if trie.root_hash != header.receipts_root:
+    if transactions and trie.root_hash != header.receipts_root:
         raise ChainError(f"block {header.number} of this chain has receipts of a kind that is not known here: no proof")
     return receipts, nodes
 
@@ -304,4 +311,6 @@ def _receipt(receipt: Mapping[str, Any]) -> bytes:
 
 
 def _bytes(value: Any) -> bytes:
+    if not isinstance(value, str):
+        raise ValueError(f"a {type(value).__name__} where hexadecimal was expected")
     return bytes.fromhex(value.removeprefix("0x"))

@@ -382,8 +382,10 @@ const evidence = (() => {
     at(hash, what) {
       const name = hex(hash)
       need(this.byHash.has(name), `the proof of ${what} does not hold: a node of its trie is missing`)
+      const node = this.byHash.get(name)
+      need(node.length <= 3 + 17 * 33 || !this.used.has(name), `the proof of ${what} has the leaf of another`)
       this.used.add(name)
-      return this.byHash.get(name)
+      return node
     }
   }
 
@@ -471,6 +473,7 @@ const evidence = (() => {
 
   // ---------------------------------------------------------------- the file
 
+  const grouped = (fingerprint) => fingerprint.replace(/(.{4})(?=.)/g, '$1 ')
   const ascending = (list) => list.every((value, n) => n === 0 || list[n - 1] < value)
   const isCount = (value) => Number.isInteger(value) && value >= 0 && value < 2 ** 53
   const list = (value, what) => {
@@ -484,6 +487,7 @@ const evidence = (() => {
 
   function read(text) {
     let file
+    need(text.length <= 2 ** 26, 'evidence has at most 64 MiB')
     try {
       file = JSON.parse(text)
     } catch {
@@ -611,7 +615,7 @@ const evidence = (() => {
       }
     })
     for (const one of signers.filter(({ key }) => key)) {
-      told(`the CA made the robot's certificate ${one.fingerprint}, which holds from chunk ${one.first} on`)
+      told(`the CA made the robot's certificate ${grouped(one.fingerprint)}, used from chunk ${one.first} on`)
     }
     told(`the robot signed the chunk of each record, and the record's path leads to the chunk's root`)
     return {
@@ -620,6 +624,6 @@ const evidence = (() => {
     }
   }
 
-  return { verify, sm3, keccak, signed, certificate, Wrong, hex, unhex, big }
+  return { verify, sm3, keccak, signed, grouped, Wrong, hex, unhex }
 })()
 if (typeof module === 'object') module.exports = evidence

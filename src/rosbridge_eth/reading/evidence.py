@@ -94,7 +94,7 @@ class Block(_Part):
 
     hash: Hex32
     header: Hex
-    receipts: list[Count]
+    receipts: Annotated[list[Count], Field(max_length=MAX_CHOSEN)]
 
 
 class Evidence(_Part):
@@ -106,9 +106,9 @@ class Evidence(_Part):
     genesis: Hex32
     contract: Annotated[Hex, Field(min_length=20, max_length=20)]
     authorities: Annotated[list[Hex], Field(min_length=1, max_length=16)]
-    records: Annotated[list[Record], Field(min_length=1)]
-    blocks: Annotated[list[Block], Field(min_length=1)]
-    nodes: list[Hex]
+    records: Annotated[list[Record], Field(min_length=1, max_length=MAX_CHOSEN)]
+    blocks: Annotated[list[Block], Field(min_length=1, max_length=MAX_CHOSEN)]
+    nodes: Annotated[list[Hex], Field(max_length=10 * MAX_CHOSEN)]
 
     def encode(self) -> str:
         """The one form: ASCII without spaces, members as above; "<" is escaped, so that no page can end in it."""
@@ -129,7 +129,7 @@ class Evidence(_Part):
     def read(data: bytes) -> Evidence:
         """The evidence in a file, JSON or page. VerificationError where it is none."""
         if len(data) > MAX_FILE:
-            raise VerificationError(f"evidence has at most {MAX_FILE >> 20} MiB; this file has {len(data):,} bytes")
+            raise VerificationError(f"evidence has at most {MAX_FILE >> 20} MiB; this file has more")
         try:
             text = data.decode()
             if _BEGIN in text:
@@ -137,8 +137,8 @@ class Evidence(_Part):
             evidence = Evidence.model_validate_json(text)
         except ValidationError as error:
             what = error.errors(include_url=False)[0]
-            where = "".join(f" {part}" for part in what["loc"])
-            raise VerificationError(f"this file is no evidence:{shown(where)}: {shown(what['msg'])}") from None
+            where = " ".join(map(str, what["loc"])) or "all of it"
+            raise VerificationError(f"this file is no evidence: {shown(where)}: {shown(what['msg'])}") from None
         except UnicodeDecodeError:
             raise VerificationError("this file is no evidence: it is not even text") from None
         if evidence.encode() != text.strip():
@@ -273,7 +273,8 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
     certificates = verifier.verdict().certificates
     records = tuple(_records_of(evidence, log, data, certificates, headers))
     for one in certificates:
-        told(f"certificate {one}")
+        if one.key is not None:
+            told(f"the CA made the robot's certificate {grouped(one.fingerprint)}, used from chunk {one.first} on")
     told("the robot signed the chunk of each record, and the record's path leads to the chunk's root")
     return Statement(
         e.robot, e.chain_id, "0x" + e.genesis.hex(), "0x" + e.contract.hex(),
@@ -379,46 +380,49 @@ def make(reading: Reading, records: Sequence[ProvenRecord]) -> Evidence:
     """
     if len(records) > MAX_CHOSEN:
         raise ConfigError(f"evidence has at most {MAX_CHOSEN:,} records; choose fewer")
-    ledger, name, log, block = reading.ledger, reading.verifier.name, reading.verifier.log, reading.top.number
-    contract, roots = bytes.fromhex(ledger.contract[2:]), reading.trust.roots
-    last, _ = chain.header_of(ledger, block)
-    [standing] = ledger.standings([log.tk], block)
-    changes = {event.block for event in ledger.registrations(log.tk, standing)}
-    wanted = {record.place.chunk: record.place.block for record in records}
-    blocks, used, data = list[Block](), dict[bytes, bytes](), dict[int, DataEvent]()
-    for number in sorted({block, *changes, *wanted.values()}):
-        header, transactions = chain.header_of(ledger, number)
-        indices = list[int]()
-        if number in changes or number in wanted.values():
-            receipts, nodes = chain.prove_receipts(ledger, header, transactions)
-            for index, receipt in enumerate(receipts):
-                events = list(chain.events_of(receipt, contract, log.tk, number))
-                found = {one.first: one for one in events if isinstance(one, DataEvent) and _holds(one, wanted)}
-                if found or any(isinstance(one, RegistrationEvent) for one in events):
-                    chain.receipt_of(nodes, header, index)
-                    indices.append(index)
-                    data |= found
-            used |= nodes.used
-        blocks.append(Block(hash=header.hash, header=header.encoded, receipts=indices))
-    batches = [chain.batch_slot(log.tk, first) for first in data]
-    nodes = chain.prove_state(ledger, last, [*chain.robot_slots(log.tk), *batches])
-    state = chain.State(nodes, last, contract)
-    state.standing(log.tk)
-    if not all(state.has(log.tk, event) for event in data.values()) or ledger.block(block).hash != last.hash:
-        raise ChainError("the chain was reorganised while its proofs were asked for; do it again")
-    evidence = Evidence(
-        robot=name, chain_id=ledger.chain_id, genesis=ledger.genesis, contract=contract,
-        authorities=sorted(root.to_der() for root in roots), records=list(_proven(reading, records, data.values())),
-        blocks=blocks, nodes=[*(used | nodes.used).values()],
-    )  # fmt: skip
-    if len(evidence.encode()) > MAX_FILE - 2**20:  # what a page adds is less
-        raise ConfigError(f"the evidence of {_records(len(records))} would exceed {MAX_FILE >> 20} MiB; choose fewer")
-    verify(evidence, roots, lambda line: None)
+    try:
+        evidence = _made(reading, records)
+        if len(evidence.encode()) > MAX_FILE - 2**20:  # what a page adds is less
+            raise ConfigError(f"this evidence would have more than {MAX_FILE >> 20} MiB; choose fewer records")
+        verify(evidence, reading.trust.roots, lambda line: None)
+    except (ChainError, VerificationError) as error:
+        raise ChainError(f"what this node gives makes no evidence: {error}; name another with --node") from error
     return evidence
 
 
-def _holds(event: DataEvent, chunks: Iterable[int]) -> bool:
-    return any(event.first <= chunk < event.first + len(event.chunks) for chunk in chunks)
+def _made(reading: Reading, records: Sequence[ProvenRecord]) -> Evidence:
+    ledger, log, top = reading.ledger, reading.verifier.log, reading.top
+    contract, authorities = bytes.fromhex(ledger.contract[2:]), sorted(root.to_der() for root in reading.trust.roots)
+    [standing] = ledger.standings([log.tk], top.number)
+    chunks = {record.place.chunk for record in records}
+    numbers = {record.place.block for record in records}
+    numbers |= {event.block for event in ledger.registrations(log.tk, standing)}
+    blocks, used, data = list[Block](), dict[bytes, bytes](), dict[int, DataEvent]()
+    for number in sorted({top.number, *numbers}):
+        header, transactions = chain.header_of(ledger, number)
+        receipts, nodes = chain.prove_receipts(ledger, header, transactions if number in numbers else ())
+        indices = list[int]()
+        for index, receipt in enumerate(receipts):
+            events = list(chain.events_of(receipt, contract, log.tk, number))
+            batches = {one.first: one for one in events if isinstance(one, DataEvent)}
+            shows = (not chunks.isdisjoint(range(n, n + len(one.chunks))) for n, one in batches.items())
+            if any(shows) or len(batches) < len(events):
+                chain.receipt_of(nodes, header, index)
+                indices.append(index)
+                data |= batches
+        used |= nodes.used
+        blocks.append(Block(hash=header.hash, header=header.encoded, receipts=indices))
+    slots = [*chain.robot_slots(log.tk), *(chain.batch_slot(log.tk, first) for first in data)]
+    nodes = chain.prove_state(ledger, header, slots)
+    state = chain.State(nodes, header, contract)
+    state.standing(log.tk)
+    if not all(state.has(log.tk, event) for event in data.values()) or ledger.block(top.number).hash != top.hash:
+        raise ChainError("the chain was reorganised meanwhile, so do it again")
+    return Evidence(
+        robot=reading.verifier.name, chain_id=ledger.chain_id, genesis=ledger.genesis, contract=contract,
+        authorities=authorities, records=list(_proven(reading, records, data.values())), blocks=blocks,
+        nodes=[*(used | nodes.used).values()],
+    )  # fmt: skip
 
 
 def _proven(reading: Reading, records: Sequence[ProvenRecord], data: Iterable[DataEvent]) -> Iterator[Record]:
