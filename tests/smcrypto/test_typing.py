@@ -10,7 +10,7 @@ from pathlib import Path
 SOURCES = Path(__file__).parents[2] / "src"
 
 PROGRAM = """
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 
 from smcrypto import kdf, sm2, sm3, sm4, x509
 
@@ -38,7 +38,7 @@ def use(data: bytes | bytearray | memoryview, key: sm2.PrivateKey, at: datetime)
     certificate = x509.Certificate.from_pem(data)
     x509.verify_chain(certificate, intermediates=[certificate], roots=[certificate], at=at, uid=data)
     request = x509.CertificateSigningRequest.create(key, subject={"CN": "r"}, uid=data)
-    issued = x509.issue(request, certificate, key, not_before=at, not_after=datetime.now(UTC))
+    issued = x509.issue(request, certificate, key, not_before=at, not_after=datetime.now(timezone.utc))
     return b"".join((sealed, opened, iv, tag, block, digest, derived, signature, text, shared, pem, issued.to_pem()))
 """
 
