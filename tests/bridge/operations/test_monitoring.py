@@ -27,6 +27,8 @@ from urllib.parse import urlencode
 
 import compose_spec
 import pytest
+from grafana_foundation_sdk.cog.encoder import JSONEncoder
+from grafana_foundation_sdk.models.dashboard import Dashboard
 from prometheus_client.parser import text_string_to_metric_families
 from ruamel.yaml import YAML
 
@@ -108,6 +110,24 @@ def test_the_panels_do_not_overlap_and_each_has_a_title_and_a_source():
         cells |= own
     assert {panel["datasource"]["uid"] for panel in PANELS} == {"${datasource}"}
     assert all(panel["title"] and panel["targets"] for panel in PANELS)
+
+
+def test_the_dashboard_is_one_by_grafanas_schema():
+    """What its models do not know, they leave out when they write it anew."""
+    model = Dashboard.from_json(json.loads((DEPLOY / "grafana/rosbridge-eth.json").read_text()))
+    written = json.loads(JSONEncoder().encode(model))
+
+    def unknown(ours: Any, theirs: Any, path: str) -> list[str]:
+        if isinstance(ours, dict):
+            return [one for key in ours for one in (unknown(ours[key], theirs[key], f"{path}.{key}") if key in theirs
+                                                    else [f"{path}.{key}"])]  # fmt: skip
+        if isinstance(ours, list):
+            assert len(ours) == len(theirs), path
+            return [one for index, each in enumerate(ours) for one in unknown(each, theirs[index], f"{path}[{index}]")]
+        assert ours == theirs, path
+        return []
+
+    assert unknown(DASHBOARD, written, "") == [".annotations.list[0].titleFormat"], "known to the Prometheus source"
 
 
 def test_every_metric_of_the_dashboard_is_one_and_every_metric_is_on_it():
