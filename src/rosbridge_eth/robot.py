@@ -49,6 +49,7 @@ LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the sour
 SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
+MARKS = 512  # places of the log for which it is known how many records of each topic they end
 LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
 
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
@@ -74,6 +75,8 @@ class Robot:
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
+        self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
+        self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
         self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
@@ -111,6 +114,19 @@ class Robot:
     def captured(self) -> int:
         """Records given to the writer; what is kept in memory for an event is not among them."""
         return self.written.total()
+
+    def confirmed(self) -> Counter[str]:
+        """Records confirmed on the chain since the start, by topic: those up to the newest place that is confirmed.
+
+        A chunk holds records of all topics, so what is kept are places of the log and not records. Of more than MARKS
+        places that wait every second is left out: then it is less, by less than what one of them stands for.
+        """
+        newest = self.sender.statistics.newest
+        done = [index for index, (stream, number, _) in enumerate(self._marks)
+                if newest is not None and stream == newest.stream and number <= newest.number]  # fmt: skip
+        for _ in range(done[-1] + 1 if done else 0):
+            self._confirmed = self._marks.popleft()[2]
+        return self._confirmed
 
     def begin_stream(self, refused: bytes) -> None:
         """The server refused a stream: if it is the one being written, go on in a new one."""
@@ -210,7 +226,7 @@ class Robot:
             self.box.keep(captured.trigger, record)
 
     def _write(self, record: Record, now: float) -> None:
-        self.writer.add(record.line, now, record.definition)
+        self.writer.add(record.line, now, record.definition, topic=record.topic)
         if record.definition is not None:  # else it is no message
             self.written[record.topic] += 1
 
@@ -226,6 +242,11 @@ class Robot:
         """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the ring."""
         self._unspooled.extend(chunks)
         self.chunks += len(chunks)
+        if chunks:
+            last = chunks[-1].header
+            self._marks.append((last.stream, last.number, self.writer.sealed.copy()))
+            if len(self._marks) > MARKS:
+                self._marks = deque([*self._marks][::-2][::-1])
         if self.spool_trouble.why is not None and now - self._spool_at < SPOOL_AGAIN:
             return
         self._spool_at = now

@@ -17,6 +17,7 @@ from rosbridge_eth.channel import Client, ClientConfig, Message
 from rosbridge_eth.channel.udp import client_socket, server_sockets
 from rosbridge_eth.chunk import Log, drop, robot_id
 from rosbridge_eth.errors import StoreError
+from rosbridge_eth.protocol import Confirmed
 from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.sender import Sender
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
@@ -143,3 +144,33 @@ def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: 
         robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
     assert robot.captured == 10
     assert "kept for later" in robot.summary
+
+
+@pytest.mark.parametrize("marks", [512, 4])
+def test_what_is_confirmed_of_a_topic_is_what_chunks_up_to_that_place_hold(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, marks: int
+) -> None:
+    monkeypatch.setattr("rosbridge_eth.robot.MARKS", marks)
+    robot = make(300)
+    emit = robot._emit
+
+    def slowly(raw: RawMessage) -> None:  # so that there are several chunks
+        time.sleep(0.001)
+        emit(raw)
+
+    monkeypatch.setattr(robot, "_emit", slowly)
+    monkeypatch.setattr(robot.spool, "close", lambda: None)
+    robot.run(on_turn=lambda: robot.stop() if robot.captured == 300 else None)
+    chunks = [*robot.spool.following(robot.writer.stream, None, 1 << 30)]
+    assert robot.writer.sealed[TOPIC] == robot.written[TOPIC] == 300 and len(chunks) > 20
+    lines, shown = -2, []  # the line that opens the stream, and that of the type
+    for chunk in chunks:
+        lines += chunk.header.records
+        robot.sender.statistics.newest = Confirmed(chunk.header.stream, chunk.header.number, 7)
+        assert robot.confirmed()[TOPIC] <= max(0, lines)
+        shown.append(robot.confirmed()[TOPIC] == max(0, lines))
+    assert shown[-1] and robot.confirmed()[TOPIC] == 300 and len(robot._marks) == 0
+    assert all(shown) == (marks == 512)
+    robot.sender.statistics.newest = Confirmed(bytes(16), 9999, 8)
+    assert robot.confirmed()[TOPIC] == 300, "of an earlier run"
+    Spool.close(robot.spool)

@@ -259,18 +259,24 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
     now, lost = time.monotonic(), Counter[str]()
     for (topic, _), count in running.lost.items():
         lost[topic] += count
-    rows = [(topic, f"{rates.of(topic, running.written[topic], now):.1f}", running.written[topic], lost[topic])
-            for topic in sorted({*running.written, *lost})]  # fmt: skip
     kept = [
         f"Trigger {each.rule.name}: {len(each.ring)} records in memory, {each.ring.bytes / 2**20:.1f} of"
         f" {each.rule.memory / 2**20:.1f} MiB; events: {each.fired}." for each in running.box.triggers.values()
     ]
     spool, sender = running.spool.statistics(), running.sender.statistics
+    written, sealed, confirmed = running.written, running.writer.sealed, running.confirmed()
+    known = not sender.refused and not spool.dropped_bodies  # else some of what is below that place is not there
+    rows = [
+        (topic, f"{rates.of(topic, written[topic], now):.1f}", written[topic], sealed[topic],
+         *((sealed[topic] - confirmed[topic], confirmed[topic]) if known else "??"), lost[topic])
+        for topic in sorted({*written, *lost})
+    ]  # fmt: skip
     newest = sender.newest
     where = f" (the last in block {newest.block})" if newest and newest.block else ""
     session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
+    columns = ["topic", "records/s", "records", "sealed", "waiting", "confirmed", "lost"]
     return Group(
-        table(name, ["topic", "records/s", "records", "lost"], rows, right=[1, 2, 3]),
+        table(name, columns, rows, right=range(1, 7)),
         *map(Text, kept),
         Text(
             f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
