@@ -28,18 +28,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
 
 from rosbridge_eth.capture import MAX_ARCHIVED_LINE, MAX_LINE, MessageLine, parse_line
-from rosbridge_eth.chunk import (
-    MAX_RECORDS,
-    Chunk,
-    Header,
-    Log,
-    Proof,
-    check_proof,
-    ledger_id,
-    open_lines,
-    proofs,
-    robot_id,
-)  # fmt: skip
+from rosbridge_eth.chunk import Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
 from rosbridge_eth.identity import Trust
@@ -83,7 +72,7 @@ class Record(_Part):
     """A record: which one of the robot's log, the line as the robot wrote it, and its way up to the chunk's root."""
 
     chunk: Count
-    record: Annotated[int, Field(ge=0, lt=MAX_RECORDS)]
+    record: Count
     line: str
     salt: Annotated[Hex, Field(min_length=16, max_length=16)]
     path: Annotated[list[Hex32], Field(max_length=10)]

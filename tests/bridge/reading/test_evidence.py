@@ -212,6 +212,16 @@ def test_a_record_whose_body_is_in_an_archive(node: Anvil, javascript):
     assert len(text) < 130_000 + 20_000
 
 
+def test_by_somebody_to_whom_the_keys_were_handed(node: Anvil, javascript):
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    made.pen.readers = [reader("insurer")]
+    chunk = made.pen.write(odometry(1), odometry(2))
+    made.write(chunk)
+    keys = {chunk.header.digest: content_key(chunk.header, reader("insurer").encryption_key)}
+    text = made.evidence(Choice("/robot_1/odom", at_ns=at(0.1)), granted=keys).encode()
+    assert [each.line for each in both(text, javascript).records] == [odometry(1)]
+
+
 def test_a_revoked_robot_is_said_to_be(node: Anvil, javascript):
     made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
     made.write(made.pen.write(odometry(1)))
