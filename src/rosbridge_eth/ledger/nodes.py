@@ -137,7 +137,7 @@ class Anvil:
         if shutil.which("anvil"):
             command = ["anvil"]
         elif shutil.which("npx"):
-            command = ["npx", "--yes", f"@foundry-rs/anvil@{VERSION}"]
+            command = ["npx", "--yes", "--prefer-offline", f"@foundry-rs/anvil@{VERSION}"]
         else:
             raise ChainError(
                 "a local chain needs anvil (https://getfoundry.sh) or, to fetch it, npx (of Node.js): install one of"

@@ -150,21 +150,22 @@ function draw(svg, robot) {
   let [left, right] = range(all.map(([x]) => x)), [low, high] = range(all.map(([, y]) => y));
   const margin = 36, scale = Math.min((width - 2 * margin) / (right - left), (height - 2 * margin) / (high - low));
   const X = (x) => width / 2 + (x - (left + right) / 2) * scale, Y = (y) => height / 2 - (y - (low + high) / 2) * scale;
-  const step = nice(70 / scale), parts = [];
+  const step = nice(70 / scale), parts = [], labels = [];
   for (let n = Math.ceil((left - width / scale) / step); n * step <= right + width / scale; n++) {
     const x = X(n * step);
     if (x < 0 || x > width) continue;
     parts.push(shape("line", { class: n ? "grid" : "axis", x1: x, x2: x, y1: 0, y2: height }));
-    if (x > 40 && x < width - 64) parts.push(shape("text", { x, y: height - 6, "text-anchor": "middle" }, short(n * step)));
+    if (x > 40 && x < width - 64) labels.push(shape("text", { x, y: height - 6, "text-anchor": "middle" }, short(n * step)));
   }
   for (let n = Math.ceil((low - height / scale) / step); n * step <= high + height / scale; n++) {
     const y = Y(n * step);
     if (y < 0 || y > height) continue;
     parts.push(shape("line", { class: n ? "grid" : "axis", x1: 0, x2: width, y1: y, y2: y }));
-    if (y > 20 && y < height - 26) parts.push(shape("text", { x: 6, y: y - 4 }, short(n * step)));
+    if (y > 20 && y < height - 26) labels.push(shape("text", { x: 6, y: y - 4 }, short(n * step)));
   }
-  parts.push(shape("text", { x: width - 6, y: height - 6, "text-anchor": "end" }, "x in m"));
-  parts.push(shape("text", { x: 6, y: 14 }, "y in m"));
+  labels.push(shape("text", { x: width - 6, y: height - 6, "text-anchor": "end" }, "x in m"));
+  labels.push(shape("text", { x: 6, y: 14 }, "y in m"));
+  parts.push(...labels);
   tracks.forEach((track, at) => {
     const colour = `t${at % 6}`, [x0, y0] = track.points[0];
     const points = track.points.map(([x, y]) => `${X(x).toFixed(1)},${Y(y).toFixed(1)}`).join(" ");

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -212,6 +214,19 @@ def test_a_state_file_that_is_damaged_is_said(tmp_path: Path, node: Anvil):
     (state := tmp_path / "chain.json").write_text('{"blocks": [{"head')
     with pytest.raises(ChainError, match=r"chain\.json is damaged"):
         Anvil.start(free_port(), state=state)
+
+
+def test_with_the_network_cable_pulled_a_chain_starts(node: Anvil):
+    """In a network of its own that has nothing but this machine; npx has fetched anvil by now."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        unavailable("only root can have a network of its own")
+    program = (
+        "import subprocess; subprocess.run(['ip', 'link', 'set', 'lo', 'up'], check=True);"
+        "from rosbridge_eth.ledger.nodes import Anvil; anvil = Anvil.start(8545); anvil.stop()"
+    )
+    subprocess.run(["unshare", "--net", sys.executable, "-c", program], check=True, timeout=50, env=os.environ | {
+        "PYTHONPATH": str(Path(nodes.__file__).parents[2])
+    })  # fmt: skip
 
 
 def test_a_port_in_use_is_said(node: Anvil):
