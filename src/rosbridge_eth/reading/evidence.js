@@ -21,7 +21,8 @@ const evidence = (() => {
     return text
   }
   const unhex = (text, size, what) => {
-    need(typeof text === 'string' && /^(?:[0-9a-f]{2})*$/.test(text), `${what} is not lower-case hexadecimal`)
+    const isHex = typeof text === 'string' && text.length % 2 === 0 && !/[^0-9a-f]/.test(text)
+    need(isHex, `${what} is not lower-case hexadecimal`)
     need(size === undefined || text.length === 2 * size, `${what} does not have ${size} bytes`)
     const bytes = new Uint8Array(text.length / 2)
     for (let n = 0; n < bytes.length; n++) bytes[n] = parseInt(text.substr(2 * n, 2), 16)
@@ -464,7 +465,7 @@ const evidence = (() => {
 
   // A record's line, its long integers as text: JavaScript's numbers would lose digits of the times.
   function parsed(line) {
-    const exact = line.replace(/"(?:[^"\\]|\\.)*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?/g, (token) =>
+    const exact = line.replace(/"[^"\\]*(?:\\.[^"\\]*)*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?/g, (token) =>
       token.length > 15 && /^-?\d+$/.test(token) ? `"${token}"` : token)
     const value = JSON.parse(exact)
     need(Object.keys(value).join() === 'topic,type,source,received_ns,captured_ns,clock,data', 'it is no captured message')
@@ -564,7 +565,7 @@ const evidence = (() => {
       need(kept && first + chunks.length <= state.chunks, `the contract does not have the batch that begins with ${first}`)
       chunks.forEach((chunk, n) => written.set(first + n, { chunk, block }))
     }
-    told(`the contract is RobotLedger and has these chunks and registrations, by the stateRoot of block ${last.number}`)
+    told(`the contract is RobotLedger and has these chunks, by the stateRoot of block ${last.number}`)
     need(nodes.used.size === nodes.byHash.size, 'there are nodes of tries that prove nothing')
 
     // registrations
@@ -586,6 +587,7 @@ const evidence = (() => {
     })
     need(big(word(before)) === changed && hash === certificatesHash && revoked === state.revoked,
       'the registrations are not those that the contract has')
+    told('the registrations of the robot are all that the contract has')
 
     // chunks and records
     const chunks = new Map()

@@ -209,7 +209,10 @@ class Statement(NamedTuple):
         if node:
             yield f"That {node} is a node of the right chain, and that the chain will not replace these blocks."
         else:
-            yield "That the blocks are the chain's: ask a node (--node), or compare their hashes with one you trust."
+            yield (
+                "That the blocks are the chain's: ask a node (--node), or compare their hashes with one you trust. If"
+                " they are not, somebody could have made this with a stolen key of the robot that is revoked since."
+            )
         yield (
             "That CA, contract and chain are the right ones: compare the CA's fingerprint, the contract's address and"
             f" the hash of the first block, {self.genesis}, with what the operator gave you by another way."
@@ -248,7 +251,7 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
     for event in data:
         if not state.has(tk, event) or event.first + len(event.chunks) > standing.chunks:
             raise VerificationError(f"the contract does not have the batch that begins with chunk {event.first}")
-    told(f"the contract is RobotLedger and has these chunks and registrations, by the stateRoot of block {last.number}")
+    told(f"the contract is RobotLedger and has these chunks, by the stateRoot of block {last.number}")
     if not len(e.nodes) == len(nodes) == len(nodes.used):
         raise VerificationError("there are nodes of tries that prove nothing")
 
@@ -259,6 +262,7 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
     )  # fmt: skip
     if not verifier.honest:
         raise VerificationError("the registrations are not those that the contract has")
+    told("the registrations of the robot are all that the contract has")
     certificates = verifier.verdict().certificates
     records = tuple(_records_of(evidence, log, data, certificates, headers))
     for one in certificates:

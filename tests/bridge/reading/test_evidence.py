@@ -203,13 +203,13 @@ def test_on_a_network_with_proof_of_authority(tmp_path: Path, javascript):
 
 def test_a_record_whose_body_is_in_an_archive(node: Anvil, javascript):
     made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
-    chunk = made.pen.write(odometry(1), message(at(1), "/image", data="iVBOR" * 20_000), archived=True)
+    chunk = made.pen.write(odometry(1), message(at(1), "/image", data="iVBOR" * 600_000), archived=True)
     made.write(on_chain=[replace(chunk, body=b"").encoded])
     bodies = {chunk.header.body_digest: chunk.body}
     text = made.evidence(Choice("/image"), bodies=lambda digest, size: bodies.get(digest)).encode()
     [shown] = both(text, javascript).records
-    assert shown.content.data["data"] == "iVBOR" * 20_000
-    assert len(text) < 130_000 + 20_000
+    assert shown.content.data["data"] == "iVBOR" * 600_000
+    assert len(text) < 3_000_000 + 20_000
 
 
 def test_by_somebody_to_whom_the_keys_were_handed(node: Anvil, javascript):
@@ -563,3 +563,5 @@ def test_a_key_off_the_curve_verifies_nothing(computed):
 
 def test_the_script_knows_the_contracts_code():
     assert f"const CODE = '{proofs.code_hash().hex()}'" in JAVASCRIPT.read_text()
+    page = Path(__file__).resolve().parents[3] / "docs" / "evidence.md"
+    assert f"CODE = {proofs.code_hash().hex()}\n" in page.read_text(encoding="utf-8")
