@@ -119,7 +119,7 @@ def read(
     """
     from rosbridge_eth.reading import outputs
 
-    choice = _choice(topic, from_, to, at)
+    choice, robot = _choice(topic, from_, to, at), [*dict.fromkeys(robot)]
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     address = _address(serve)
@@ -147,9 +147,7 @@ def read(
             )
         else:
             [name] = robot
-            reading, of_it = stack.enter_context(
-                _reading(place, name, node, confirmations, confirm, passphrase_file)
-            )
+            reading, of_it = stack.enter_context(_reading(place, name, node, confirmations, confirm, passphrase_file))
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
         made = None if bag is None else files.enter_context(outputs.bag(bag, grows=follow))
@@ -410,7 +408,7 @@ def _following(
     turns: called whenever all was given that there is.
     """
     from rosbridge_eth.reading.follow import EVERY, Followed, Following
-    from rosbridge_eth.reading.live import Page, View
+    from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
     with _asking(place, nodes, confirmations, file) as asked, ExitStack() as stack:
@@ -421,6 +419,8 @@ def _following(
             page = Page(address, view)
             stack.callback(page.close)
             talk(f"The page is http://{page.address}/; Ctrl-C ends it.")
+            if address.host not in OWN_NAMES:
+                talk("It has no password: whoever reaches that address sees what this reader may read.")
 
         def end(number: int, frame: object) -> None:
             stop.set()

@@ -35,6 +35,8 @@ EVIDENCE = ("evidence", "robot_1", "evidence.json", *READER)
 VECTOR = PAGE.parents[1] / "tests" / "vectors" / "evidence"
 VERIFY = ("verify", str(VECTOR / "span.json"), "--ca", str(VECTOR / "ca.crt.pem"))
 CHECK = ("check", "robot_1", STREAM.hex(), "0")
+GRANT = ("grant", "robot_1", "--from", "2026-01-01T00:00:00Z", "--to", "2100-01-01T00:00:00Z",
+         "--reader", "reader/public.pem", *READER)  # fmt: skip
 Given = Callable[[Place, Keyring], object]
 
 
@@ -91,6 +93,14 @@ def forged(place: Place, keys: Keyring) -> None:
     place.ledger.set_data(account, TK, [next(iter(chunk_chain(1))).encoded])
 
 
+def altered_grant(place: Place, keys: Keyring) -> None:
+    replayed(place, keys)
+    place.path.joinpath("reader", "grants").mkdir()
+    assert run([*GRANT, "--out", "reader/grants/g"]) == 0
+    file = place.path / "reader" / "grants" / "g"
+    file.write_bytes(file.read_bytes().replace(b"robot_1", b"robot_2"))
+
+
 def triggered(place: Place, keys: Keyring) -> None:
     """A process that shows a trigger, as a robot does, and takes one event."""
     program = """
@@ -122,6 +132,9 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("what is there is not what", ("read", "robot_1", *READER), forged),
     ("it is sound, and every record is sealed for others", ("read", "robot_1", *READER), written),
     ("no robot of that name is in the contract", ("read", "robot_9", *READER), as_it_is),
+    ("a file in `grants/` is altered", ("read", "robot_1", *READER), altered_grant),
+    ("the file is written", GRANT, replayed),
+    ("this reader can open nothing", GRANT, as_it_is),
     ("the running robot has taken it", ("trigger", "crash"), triggered),
     ("no robot runs with that home", ("trigger", "crash"), as_it_is),
     ("every message of the bag is on the chain", COMPARE, replayed),

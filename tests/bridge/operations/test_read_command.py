@@ -153,7 +153,7 @@ def test_the_page_is_served_while_it_is_followed(
 
     replayed(place, keys)
     steps(monkeypatch, look, lambda: os.kill(os.getpid(), signal.SIGINT))
-    assert run([*READ, "--follow", "--serve", "0"]) == 0
+    assert run([*READ, "robot_1", "--follow", "--serve", "0"]) == 0
     assert b"<title>Robots" in shown[0]
     [robot] = json.loads(shown[3].removeprefix(b"data: "))["robots"]
     assert (robot["name"], robot["sound"], robot["tracks"][0]["count"]) == ("robot_1", True, 300)
