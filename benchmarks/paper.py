@@ -183,7 +183,7 @@ def reorganisation(dag: Path) -> Part:
         [robot] = operator.robots
         tk = load.robot_id(robot.name)
         session = load.Session(operator, robot, ("127.0.0.1", 9))
-        sealed = session.seal(300, 20)
+        sealed = session.seal(300, 15)
         chunks = [load.Chunk.parse(chunk) for chunk in sealed.values()]
         inbox = open_store(operator.config, operator.home)
         submitter = open_submitter(
