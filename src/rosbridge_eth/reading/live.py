@@ -21,6 +21,7 @@ from itertools import islice
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.config.values import Address, time_text
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.reading.follow import EVERY, Followed
@@ -56,7 +57,7 @@ class View:
         self._lock, self.version, self.closed = threading.Lock(), 0, threading.Event()
         self._about = {"nodes": nodes, "confirmations": confirmations}
         self._tracks = {name: Trajectory(MAX_POINTS) for name in robots}
-        self._latest: dict[str, dict[str, ProvenRecord]] = {name: {} for name in self._tracks}
+        self._latest: dict[str, dict[str, ProvenRecord | dict[str, Any]]] = {name: {} for name in self._tracks}
         self._stands: dict[str, dict[str, Any]] = {name: {} for name in self._tracks}
 
     def write(self, name: str, record: ProvenRecord) -> None:
@@ -64,7 +65,8 @@ class View:
             self._tracks[name].write(record)
             latest = self._latest[name]
             if record.content.topic in latest or len(latest) < MAX_TOPICS:
-                latest[record.content.topic] = record
+                # What is shown of it is made when it is asked for; an image of an archive is not kept until then.
+                latest[record.content.topic] = record if len(record.line) <= MAX_LINE else _values(record)
             self.version += 1
 
     def show(self, robots: Iterable[Followed]) -> None:
@@ -79,7 +81,8 @@ class View:
         with self._lock:
             robots = [
                 {"name": name, **self._stands[name], "tracks": _tracks(track),
-                 "latest": [_values(one) for _, one in sorted(self._latest[name].items())]}
+                 "latest": [one if isinstance(one, dict) else _values(one)
+                            for _, one in sorted(self._latest[name].items())]}
                 for name, track in self._tracks.items()
             ]  # fmt: skip
             return self.version, json.dumps(self._about | {"robots": robots}, separators=(",", ":")).encode()

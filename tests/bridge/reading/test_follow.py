@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from bridge.reading.test_fetch import ACCOUNT, ETH, KEYS, NOW, OPERATOR, Chain, Node, chain
-from bridge.reading.world import NAME, Pen, authority, reader, robot
+from bridge.reading.world import NAME, Pen, authority, message, reader, robot
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, IdentityError
 from rosbridge_eth.identity import Trust
@@ -25,11 +25,11 @@ __all__ = ["chain"]
 class Follow:
     """A `Following`, and what each look gave."""
 
-    def __init__(self, folder: Path, *ledgers: Any, names: tuple[str, ...] = (NAME,), confirmations: int = 1) -> None:
+    def __init__(self, folder: Path, *ledgers: Any, names: tuple[str, ...] = (NAME,), **more: Any) -> None:
         self.bookmarks = Bookmarks(folder / "bookmarks.json")
         read = partial(
             read_robot, ledgers, trust=Trust([authority().certificate]), reader=reader().encryption_key,
-            bookmarks=self.bookmarks, cache=folder / "proven", confirmations=confirmations,
+            bookmarks=self.bookmarks, cache=folder / "proven", **more,
         )  # fmt: skip
         self.robots = [Followed(name, read, self.bookmarks) for name in names]
         self.following = Following(self.robots, ledgers)
@@ -172,6 +172,26 @@ def test_what_is_behind_withheld_chunks_is_given_after_them(chain: Chain, tmp_pa
     chain.where.ethereum_tester.mine_block()
     assert follow.look() == [2, 3, 4, 5, 6]
     assert follow.verdict.sound
+
+
+def test_a_body_that_is_not_in_the_archive_holds_nothing_up(chain: Chain, tmp_path: Path):
+    bodies = dict[bytes, bytes]()
+    node = Flaky(chain.ledger, "http://flaky")
+
+    def archive(digest: bytes, length: int) -> bytes | None:
+        return bodies.get(digest)
+
+    follow = Follow(tmp_path, node, bodies=archive)
+    first, archived = chain.pen.chunks(1), chain.pen.write(message(1), archived=True)
+    chain.write([*first, archived.on_chain, *chain.pen.chunks(1)])
+    assert follow.look() == [0, 2] and follow.verdict.counts["withheld"] == 1
+    for n in (3, 4):
+        chain.write(chain.pen.chunks(1))
+        node.fails_after = 1  # of the events that are asked for: the new one alone
+        assert follow.look() == [n] and not follow.robots[0].trouble
+    assert follow.verdict.counts["withheld"] == 1 and not follow.verdict.sound
+    bodies[archived.header.body_digest] = archived.body
+    assert Follow(tmp_path, chain.ledger, bodies=archive).look() == [0, 1, 2, 3, 4]
 
 
 def test_what_becomes_final_meanwhile_is_kept_and_nothing_is_given_twice(chain: Chain, tmp_path: Path):

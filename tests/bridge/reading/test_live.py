@@ -17,9 +17,10 @@ from bridge.browser import Browser
 from bridge.reading.test_fetch import Chain, chain
 from bridge.reading.test_follow import Follow
 from bridge.reading.world import NAME, line
+from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.reading import Choice
+from rosbridge_eth.reading import Choice, Place, ProvenRecord
 from rosbridge_eth.reading.live import MAX_FIELDS, MAX_PAGES, MAX_POINTS, MAX_TOPICS, Page, View
 
 __all__ = ["chain"]
@@ -120,6 +121,16 @@ def test_each_event_is_all_there_is_to_show_and_bounded(watch: Watch):
     assert track["count"] == 2708 and MAX_POINTS / 2 <= len(track["points"]) <= MAX_POINTS + 1
     assert track["points"][-1] == [2699 / 2, -2699 / 4]
     assert len(robot["latest"]) == MAX_TOPICS and len(robot["tracks"]) <= 32
+
+
+def test_of_a_large_record_no_more_is_kept_than_is_shown(watch: Watch):
+    record = parse_line(odometry(1, image="x" * 200_000), 2**20)
+    assert isinstance(record, MessageLine)
+    watch.view.write(NAME, ProvenRecord(Place(0, b"", 0, b"", 0, 0, b""), 0, b"x" * 200_000, record, None))
+    [kept] = watch.view._latest[NAME].values()
+    assert isinstance(kept, dict) and len(str(kept)) < 1_000
+    [robot] = json.loads(watch.view.state()[1])["robots"]
+    assert dict(robot["latest"][0]["fields"])["image"] == "x" * 77 + "..."
 
 
 def test_pages_beyond_the_bound_are_refused_and_closed_ones_make_room(watch: Watch):
