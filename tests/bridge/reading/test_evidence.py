@@ -22,6 +22,7 @@ from bridge.reading.world import NAME, START, Pen, authority, message, reader, r
 from conftest import unavailable
 from ports import free_port
 from rosbridge_eth.chunk import Chunk, content_key
+from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
 from rosbridge_eth.ledger import Ledger, proofs
@@ -402,6 +403,16 @@ def test_who_is_not_the_robot_by_the_ca_is_refused(ca, role, name, node: Anvil, 
         check(text)
     [answer] = javascript([text])
     assert "no certificate governs it" in answer
+
+
+def test_a_page_that_this_version_did_not_write_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    page, file = Evidence.read((VECTORS / "span.json").read_bytes()).page(), tmp_path / "page.html"
+    for text, told in ((page, False), (page.replace("The record", "The only record"), True)):
+        file.write_text(text, encoding="utf-8")
+        assert run(["verify", str(file), "--ca", str(VECTORS / "ca.crt.pem")]) == 0
+        said = capsys.readouterr()
+        assert ("The page around it is not as this version writes it" in said.err) == told
+        assert len(said.out.splitlines()) == 5 and "What it does not prove:" in said.err
 
 
 # ---------------------------------------------------------------------- files from anybody
