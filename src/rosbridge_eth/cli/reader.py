@@ -89,7 +89,7 @@ def _address(text: str | None) -> Address | None:
 
 
 def read(
-    robot: Annotated[list[str], typer.Argument(metavar="ROBOT...", help="The robot's name; several with --serve.")],
+    robot: Annotated[list[str], typer.Argument(metavar="ROBOT", help="The robot's name; several with --serve.")],
     home: ReaderHomeOption = READER_HOME,
     topic: Topic = None,
     from_: From = None,
@@ -130,7 +130,7 @@ def read(
     if follow and bag is not None and bag.suffix != ".mcap":
         raise typer.BadParameter(f"only an .mcap file can be read while it grows, not {bag}", param_hint="--bag")
     if len(robot) > 1 and (address is None or bag or table or plot):
-        raise typer.BadParameter("a file has one robot's records; several are for --serve", param_hint="ROBOT...")
+        raise typer.BadParameter("a file has one robot's records; several are for --serve", param_hint="ROBOT")
     place = ReaderHome(home).require()
     for path, check in ((bag, outputs.check_bag), (table, outputs.check_table), (plot, outputs.check_picture)):
         if path is not None:
