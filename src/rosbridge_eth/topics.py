@@ -99,8 +99,7 @@ class Heard:
 
 def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, Any]:
     """Listen for so many seconds at most; what `topics --json` prints. Raises SourceError, ConfigError."""
-    from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_gas
-    from rosbridge_eth.ledger.submitter import BATCH_BYTES
+    from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_cost
 
     source, stop, room = everything(config), threading.Event(), [ENOUGH]
     capture = Capture([*config.rules(), TopicRule("**")], source_kind=source.kind, live=True)
@@ -129,8 +128,7 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     selection, days = config.selection(), max(took, 1.0) / DAY
     chosen = [topic for topic in heard.values() if selection.wants(topic.offer)]
     chunks = _sealed([line for topic in chosen for line in topic.all_day], config, source.kind, readers)
-    sizes, alone = [len(chunk.encoded) for chunk in chunks], set_data_gas([])
-    full = set_data_gas(sizes) - alone + alone * sum(sizes) / BATCH_BYTES
+    sizes = [len(chunk.encoded) for chunk in chunks]
     bodies = {name: sum(len(chunk.body) for chunk in _sealed(topic.all_day, config, source.kind, readers))
               for name, topic in heard.items()}  # fmt: skip
     return {
@@ -143,7 +141,8 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
             for name, topic in sorted(heard.items())
         ],
         "chunks_per_day": len(sizes) / days, "bytes_per_day": sum(sizes) / days,
-        "gas_per_day": {"full_batches": full / days, "one_chunk_each": sum(set_data_gas([s]) for s in sizes) / days},
+        "gas_per_day": {"full_batches": set_data_cost(sizes) / days,
+                        "one_chunk_each": sum(set_data_cost([size]) for size in sizes) / days},
     }  # fmt: skip
 
 

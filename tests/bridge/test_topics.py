@@ -12,7 +12,7 @@ from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.ledger.contract import set_data_gas
+from rosbridge_eth.ledger.contract import set_data_cost
 from rosbridge_eth.sources import sample_bag
 from rosbridge_eth.topics import robot_toml
 
@@ -71,7 +71,7 @@ def test_the_cost_is_that_of_what_robot_toml_takes(capsys: Capture):
     assert odom["bytes_per_day"] < everything["bytes_per_day"] and odom["chunks_per_day"] == pytest.approx(DAY, rel=0.1)
     gas = odom["gas_per_day"]
     chunk = odom["bytes_per_day"] / odom["chunks_per_day"]
-    assert gas["one_chunk_each"] == pytest.approx(odom["chunks_per_day"] * set_data_gas([round(chunk)]), rel=0.02)
+    assert gas["one_chunk_each"] == pytest.approx(odom["chunks_per_day"] * set_data_cost([round(chunk)]), rel=0.02)
     assert 40 * odom["bytes_per_day"] < gas["full_batches"] < gas["one_chunk_each"]
     text = Path("robot/robot.toml").read_text()
     Path("robot/robot.toml").write_text(text.replace('"/robot_1/odom"', '{topic = "/robot_1/odom", rate = 1.0}'))

@@ -135,7 +135,7 @@ class Submitter:
         self.head: Block | None = None
         self.operator_balance: int | None = None  # the operator's, wei, a minute old at most
         self.standings: Mapping[bytes, Standing] = {}  # at the last look
-        self.gas: Counter[bytes] = Counter()  # of the transactions sent for each robot, as offered
+        self.gas: Counter[bytes] = Counter()  # that the transactions sent for each robot use
         self.counts: Counter[str] = Counter()
 
     @property
@@ -368,11 +368,12 @@ class Submitter:
                 break
             if account.careful:
                 self._try(work.tk, account, batch, now)
-            if not self._affords(account, batch.gas, now):
+            used = contract.set_data_cost([row.size for row in batch.rows])
+            if not self._affords(account, used, now):
                 account.hold = "it used the gas of its day (gas_per_day); more comes by the hour"
                 break
             account.hold = None
-            self.gas[work.tk] += batch.gas
+            self.gas[work.tk] += used
             new.append(batch)
             rest, first, front = rest[len(batch.rows) :], batch.end, batch.rows[-1].hash
         self.counts["sent"] += len(new)

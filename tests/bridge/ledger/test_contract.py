@@ -14,7 +14,7 @@ from bridge.ledger.world import ETH, KEYS
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import Ledger, RegistrationEvent
-from rosbridge_eth.ledger.contract import NOTHING, Standing, artifact, set_data_gas
+from rosbridge_eth.ledger.contract import NOTHING, Standing, artifact, set_data_cost, set_data_gas
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 
@@ -262,6 +262,7 @@ def test_the_gas_formula_holds_on_the_evm(rules: type, size: int, count: int):
     if rules is PragueVM:
         used = made.set_data(ROBOT, TK, [secrets.token_bytes(size)] * count).gas_used
         assert set_data_gas([size] * count) <= 1.25 * used + 60_000
+        assert set_data_cost([size] * count) == pytest.approx(used, rel=0.03)
 
 
 def test_a_record_costs_at_most_3800_gas(made: Ledger):
