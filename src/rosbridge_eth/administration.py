@@ -27,7 +27,7 @@ from rosbridge_eth.config import Address, ServerConfig, load_server_config, pars
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import read_file, write_atomically
-from rosbridge_eth.home import Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, require_empty
+from rosbridge_eth.home import Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, new_home, require_empty
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
@@ -103,20 +103,23 @@ def init_home(
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
     parse_config(ServerConfig, text, home.config)
-    for folder in (home.path, home.bundles, home.readers):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    authority = _make_ca(ca or home.path / "ca", ca_passphrase or passphrase, now)
-    write_atomically(home.ca_certificate, authority.certificate.to_pem())
-    with Registry(home.registry, new=True) as registry:
-        identity = ids.enrol(authority, Role.SERVER, server, at=now)
-        ids.save_identity(home.server, identity, [authority.certificate], passphrase)
-        registry.enrol(identity.public, now)
-        _make_reader(home, reader, OWNER, authority, reader_passphrase, now, registry)
-    keys = keys or Keyring.create()
-    keys.save(home.accounts, passphrase)
-    write_atomically(home.config, text.encode())
-    elsewhere = {} if ca is None else {"ca": str(ca.absolute())}
-    make_home(home.path, HomeKind.OPERATOR, **elsewhere, reader=str(reader.path.absolute()))
+    if home.path.resolve() == reader.path.resolve():
+        raise ConfigError(f"{home.path} cannot be the reader's home as well; choose another folder for one of them")
+    with new_home(home.path), new_home(reader.path):
+        for folder in (home.bundles, home.readers):
+            folder.mkdir(mode=0o700)
+        authority = _make_ca(ca or home.path / "ca", ca_passphrase or passphrase, now)
+        write_atomically(home.ca_certificate, authority.certificate.to_pem())
+        keys = keys or Keyring.create()
+        keys.save(home.accounts, passphrase)
+        with Registry(home.registry, new=True) as registry:
+            identity = ids.enrol(authority, Role.SERVER, server, at=now)
+            ids.save_identity(home.server, identity, [authority.certificate], passphrase)
+            registry.enrol(identity.public, now)
+            _make_reader(home, reader, OWNER, authority, reader_passphrase, now, registry)
+        write_atomically(home.config, text.encode())
+        elsewhere = {} if ca is None else {"ca": str(ca.absolute())}
+        make_home(home.path, HomeKind.OPERATOR, **elsewhere, reader=str(reader.path.absolute()))
     return keys
 
 
@@ -162,16 +165,17 @@ def backup(path: Path, target: Path) -> None:
     """Copy a home, in use or not, into a new folder. Left out are a CA kept elsewhere, and a robot's spool: a log that
     goes on from an old copy would look forked."""
     home_of(path)
-    require_empty(target)
-    target.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if path.resolve() in target.resolve().parents:
+        raise ConfigError(f"{target} lies in {path}, whose loss it shall outlast; choose a folder elsewhere")
     skipped = shutil.ignore_patterns("*.sqlite*", "*.lock", ".*", "home.json")
-    shutil.copytree(path, target, ignore=skipped, dirs_exist_ok=True)
-    for database in path.glob("*.sqlite"):
-        if database.name != "spool.sqlite":
-            with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(target / database.name)) as copy:
-                ours.backup(copy)
-            (target / database.name).chmod(0o600)
-    shutil.copy2(path / "home.json", target)
+    with new_home(target):
+        shutil.copytree(path, target, ignore=skipped, dirs_exist_ok=True)
+        for database in path.glob("*.sqlite"):
+            if database.name != "spool.sqlite":
+                with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(target / database.name)) as copy:
+                    ours.backup(copy)
+                (target / database.name).chmod(0o600)
+        shutil.copy2(path / "home.json", target)
 
 
 def change_passphrase(path: Path, old: bytes, new: bytes) -> list[Path]:
@@ -266,8 +270,7 @@ def add_reader(
     replace: take a used name over. What was sealed for the old one only its own keys open.
     """
     check_name(name)
-    require_empty(reader.path)
-    with Registry(home.registry) as registry:
+    with new_home(reader.path), Registry(home.registry) as registry:
         if not replace:
             registry.require_free(Role.READER, name)
         if len({name, *(known.name for known in registry.readers())}) > MAX_READERS:

@@ -11,13 +11,14 @@ are in it, encrypted under the registration password, and the whole is a sealed 
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
-from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, require_empty
+from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, new_home, require_empty
 from rosbridge_eth.identity import KEY_FILES, check_name
 from smcrypto import SMCryptoError, sm2, x509
 
@@ -102,13 +103,13 @@ def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
 def ask_to_join(home: RobotHome, name: str, password: bytes, config: str = FIRST_CONFIG) -> Request:
     """Make a robot's home with keys of its own and this robot.toml, and the request that a bundle answers."""
     check_name(name)
-    require_empty(home.path)
-    _make_folders(home, config)
-    keys = [sm2.PrivateKey.generate() for _ in KEY_FILES]
-    ids.write_files(home.identity, {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)})
-    request = Request.make(name, *keys)
-    write_atomically(home.request, request.encode())
-    make_home(home.path, HomeKind.ROBOT, name=name)
+    with new_home(home.path):
+        _make_folders(home, config)
+        keys = [sm2.PrivateKey.generate() for _ in KEY_FILES]
+        ids.write_files(home.identity, {name: key.to_pem(password) for name, key in zip(KEY_FILES, keys, strict=True)})
+        request = Request.make(name, *keys)
+        write_atomically(home.request, request.encode())
+        make_home(home.path, HomeKind.ROBOT, name=name)
     return request
 
 
@@ -133,13 +134,14 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     )  # fmt: skip
     if home.bridge_file.exists() and home.bridge().ledger != bundle.end.ledger:
         raise ConfigError(f"{home.path} writes to another ledger already; choose another folder")
-    _make_folders(home)
-    ids.write_files(home.identity, files)
-    for name, pem in bundle.readers.items():
-        write_atomically(home.readers / f"{name}.pem", pem.encode())
-    home.raise_clock_floor(peer.not_before.timestamp())
-    home.save_bridge(bundle.end)
-    make_home(home.path, HomeKind.ROBOT, name=bundle.end.robot)
+    with new_home(home.path) if bundle.keys else nullcontext():
+        _make_folders(home)
+        ids.write_files(home.identity, files)
+        for name, pem in bundle.readers.items():
+            write_atomically(home.readers / f"{name}.pem", pem.encode())
+        home.raise_clock_floor(peer.not_before.timestamp())
+        home.save_bridge(bundle.end)
+        make_home(home.path, HomeKind.ROBOT, name=bundle.end.robot)
     return roots[0].fingerprint().hex()
 
 

@@ -1,7 +1,8 @@
 """The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
-Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none. While a
-server or robot runs, `.figures` leads to what it counts (metrics).
+Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none: its
+`.unfinished` is left, and who makes a home there begins anew. While a server or robot runs, `.figures` leads to what it
+counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:
 
@@ -38,8 +39,11 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -52,6 +56,7 @@ from rosbridge_eth.files import write_atomically
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
 _FORMAT = "rosbridge-eth home 2"
 _OF_THE_FIRST_EDITION = ("server.toml", "bridge.json", "reader.toml", "journal.sqlite")
+_UNFINISHED = ".unfinished"
 
 
 class HomeKind(StrEnum):
@@ -134,7 +139,9 @@ def make_home(path: Path, kind: HomeKind, **more: str) -> None:
 
 def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[str, Any]:
     """What `make_home` wrote. ConfigError where it is nobody's home, of the first edition, or not of this kind."""
-    if not (path / "home.json").exists() and any((path / name).exists() for name in _OF_THE_FIRST_EDITION):
+    if not any((path / name).exists() for name in ("home.json", _UNFINISHED)) and any(
+        (path / name).exists() for name in _OF_THE_FIRST_EDITION
+    ):
         raise ConfigError(
             f"{path} is a home of the first edition, whose records have another format, or lost its home.json;"
             " make a new home in another folder"
@@ -160,8 +167,43 @@ def require_empty(path: Path) -> None:
     """ConfigError unless nothing is there yet: a home does not move in with anything else."""
     if (path / "home.json").exists():
         raise ConfigError(f"{path} is {_WHOSE[kind_of(path)]} home already; choose another folder")
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and not (path / _UNFINISHED).exists() and (not path.is_dir() or any(path.iterdir())):
         raise ConfigError(f"{path} is not empty; choose another folder, or remove it")
+
+
+@contextmanager
+def new_home(path: Path) -> Iterator[None]:
+    """An empty folder for a home, which is whole when the block ends; cut short, by a kill too, nothing of it counts.
+
+    ConfigError where anything else is there, or another process makes a home of it.
+    """
+    require_empty(path)
+    ours, mark = not path.exists(), path / _UNFINISHED
+    path.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with mark.open("ab") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"another process makes a home of {path}; wait for it, or choose another folder") from None
+        require_empty(path)  # which that process may have ended in between
+        _clear(path)
+        try:
+            yield
+        except BaseException:
+            _clear(path)
+            mark.unlink(missing_ok=True)
+            if ours:
+                path.rmdir()
+            raise
+        mark.unlink(missing_ok=True)
+
+
+def _clear(path: Path) -> None:
+    for each in path.iterdir():
+        if each.is_dir() and not each.is_symlink():
+            shutil.rmtree(each)
+        elif each.name != _UNFINISHED:
+            each.unlink()
 
 
 class OperatorHome:

@@ -91,6 +91,11 @@ def test_a_home_is_complete_or_none(world: World, tmp_path: Path, monkeypatch: p
         admin.init_home(half, PASSPHRASE, reader=ReaderHome(tmp_path / "r"), reader_passphrase=b"r", now=NOW)
     with pytest.raises(ConfigError):
         half.require()
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="cannot be the reader's home as well"):
+        admin.init_home(half, PASSPHRASE, reader=ReaderHome(half.path), reader_passphrase=b"r", now=NOW)
+    admin.init_home(half, PASSPHRASE, reader=ReaderHome(tmp_path / "r"), reader_passphrase=b"r", now=NOW)
+    assert half.require() and ReaderHome(tmp_path / "r").require()
 
 
 def test_the_seed_of_a_mnemonic_and_a_passphrase_file_are_taken(tmp_path: Path) -> None:
@@ -204,6 +209,12 @@ def test_a_backup_of_a_home_in_use_is_a_home(world: World, tmp_path: Path) -> No
     assert copy.deployment() == world.home.deployment() and not (copy.path / "submitter.lock").exists()
     with pytest.raises(ConfigError, match="already"):
         admin.backup(world.home.path, tmp_path / "copy")
+
+
+def test_a_backup_lies_outside_the_home(world: World) -> None:
+    with pytest.raises(ConfigError, match="whose loss it shall outlast"):
+        admin.backup(world.home.path, world.home.path / "copy")
+    assert not (world.home.path / "copy").exists()
 
 
 def test_a_robots_backup_leaves_its_log_out(world: World, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from rosbridge_eth.home import (
     home_of,
     kind_of,
     make_home,
+    new_home,
     require_empty,
 )
 
@@ -47,6 +48,38 @@ def test_what_is_no_home_says_how_to_make_one(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=way):
             ask()
+
+
+def test_a_home_that_was_cut_short_is_begun_anew(tmp_path: Path) -> None:
+    """A kill leaves what there was at that moment; a failure or Ctrl-C leaves nothing."""
+    killed = new_home(tmp_path / "home")
+    killed.__enter__()
+    (tmp_path / "home/server.toml").write_text("half")
+    (tmp_path / "home/ca").mkdir()
+    with pytest.raises(ConfigError, match="another process makes a home"), new_home(tmp_path / "home"):
+        pass
+    del killed  # which lets its lock go, and takes what it made away
+    (tmp_path / "home/ca").mkdir(parents=True)
+    for name in (".unfinished", "server.toml"):
+        (tmp_path / "home" / name).touch()
+    with pytest.raises(ConfigError, match="is not an operator's home; run `init"):
+        OperatorHome(tmp_path / "home").require()
+    with new_home(tmp_path / "home"):
+        assert [path.name for path in (tmp_path / "home").iterdir()] == [".unfinished"]
+        make_home(tmp_path / "home", HomeKind.ROBOT, name="x")
+    assert [path.name for path in (tmp_path / "home").iterdir()] == ["home.json"]
+    (tmp_path / "home/.unfinished").touch()  # killed at the very end
+    with pytest.raises(ConfigError, match="a robot's home already"), new_home(tmp_path / "home"):
+        pass
+    with pytest.raises(KeyboardInterrupt), new_home(tmp_path / "other"):
+        (tmp_path / "other/file").touch()
+        raise KeyboardInterrupt
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/precious").touch()
+    with pytest.raises(ConfigError, match="not empty"), new_home(tmp_path / "other"):
+        pass
+    assert (tmp_path / "other/precious").exists()
 
 
 @pytest.mark.parametrize("file", ["server.toml", "bridge.json", "reader.toml", "journal.sqlite"])
