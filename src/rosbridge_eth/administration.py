@@ -27,7 +27,16 @@ from rosbridge_eth.config import Address, ServerConfig, load_server_config, pars
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import read_file, write_atomically
-from rosbridge_eth.home import Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, new_home, require_empty
+from rosbridge_eth.home import (
+    Deployment,
+    HomeKind,
+    OperatorHome,
+    ReaderHome,
+    home_of,
+    make_home,
+    new_home,
+    require_empty,
+)  # fmt: skip
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
@@ -171,10 +180,10 @@ def backup(path: Path, target: Path) -> None:
     with new_home(target):
         shutil.copytree(path, target, ignore=skipped, dirs_exist_ok=True)
         for database in path.glob("*.sqlite"):
-            if database.name != "spool.sqlite":
-                with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(target / database.name)) as copy:
-                    ours.backup(copy)
-                (target / database.name).chmod(0o600)
+            if (copy := target / database.name).name != "spool.sqlite":
+                with closing(sqlite3.connect(database)) as ours, closing(sqlite3.connect(copy)) as theirs:
+                    ours.backup(theirs)
+                copy.chmod(0o600)
         shutil.copy2(path / "home.json", target)
 
 

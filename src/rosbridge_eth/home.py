@@ -184,7 +184,7 @@ def new_home(path: Path) -> Iterator[None]:
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ConfigError(f"another process makes a home of {path}; wait for it, or choose another folder") from None
+            raise ConfigError(f"another process makes a home of {path}; wait, or choose another folder") from None
         require_empty(path)  # which that process may have ended in between
         _clear(path)
         try:

@@ -122,6 +122,7 @@ def test_join_takes_all_that_a_source_offers_where_nobody_is_to_be_asked(capsys:
 @pytest.mark.parametrize("arguments, code, says", [
     (["--yes"], ExitCode.CONFIG, "ROS_MASTER_URI"),
     (["--source", "absent.bag"], ExitCode.SOURCE, "absent.bag"),
+    (["--source", "absent.bag", "--topic", "/a"], ExitCode.SOURCE, "absent.bag"),
     (["--source", "gopher://robot", "--topic", "/a"], ExitCode.CONFIG, "master"),
     (["--source", "sim", "--topic", "a b"], ExitCode.CONFIG, "a b"),
 ])

@@ -139,6 +139,15 @@ def up(
             anvil = stack.enter_context(Anvil.start(port, state=state))
             anvil.fund(place.account, 1000)
             talk(f"A local chain answers at {anvil.url}, kept in {state}.")
+        elif port is not None and deployed:
+            try:
+                with ledger_of(place):  # as when `chain` runs it
+                    pass
+            except ChainError as error:
+                raise ChainError(
+                    f"port {port} of 127.0.0.1, where the chain kept in {state} is to answer, is in use by something"
+                    " else: end that (the `up` or `chain` of another home?), then run `up` again"
+                ) from error
         if not deployed:
             made = deploy_contract(place, url, keys)
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")

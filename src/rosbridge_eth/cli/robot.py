@@ -22,6 +22,7 @@ from rich.text import Text
 from rosbridge_eth import bundle as bundles
 from rosbridge_eth import terminal
 from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
+from rosbridge_eth.config.models import BagConfig
 from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.home import RobotHome, require_empty
 from rosbridge_eth.identity import check_name
@@ -94,9 +95,10 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
         asked = "Messages come from (ros1, ros2, sim, a ROS 1 master's URI, or a bag)"
         source = str(typer.prompt(asked, default=found, err=True)) if asks else found
     config = parse_config(RobotConfig, robot_toml(topics or ["**"], source), place.config)
-    if not topics:
+    if not topics or isinstance(config.source, BagConfig):  # a bag is there already, or it is a slip of the pen
         with closing(everything(config)) as opened:
-            offers = offered(opened)
+            offers = [] if topics else offered(opened)
+    if not topics:
         topics = sorted({offer.topic for offer in offers} - PLUMBING)
         if asks and offers:
             topics = _choose(offers, topics)
@@ -112,13 +114,20 @@ def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
     rows = [(number, offer.topic, offer.type_name) for number, offer in numbered.items()]
     errors.print(table("Topics", ["", "topic", "type"], rows, right=[0]))
     while True:
-        given = str(typer.prompt("Which, by number, name or pattern", default="all", err=True))
-        words = re.split("[ ,]+", given.strip())
-        if none := [word for word in words if word.isdigit() and word not in numbered]:
-            talk(f"There is no number {none[0]}.")
+        given = str(typer.prompt("Which, by number, name or pattern", default="all", err=True)).strip(" ,")
+        if given == "all":
+            return suggested
+        words = re.split("[ ,]+", given)
+        if absent := [word for word in words if word.isdigit() and word not in numbered]:
+            talk(f"There is no number {', '.join(absent)}: the numbers are 1 to {len(numbered)}.")
             continue
-        chosen = (numbered[word].topic if word in numbered else word for word in words)
-        return suggested if given == "all" else [*dict.fromkeys(chosen)]
+        chosen = list(dict.fromkeys(numbered[word].topic if word in numbered else word for word in words))
+        try:
+            parse_config(RobotConfig, robot_toml(chosen, "sim"), Path("Again"))
+        except ConfigError as error:
+            talk(f"{error}.")
+            continue
+        return chosen
 
 
 def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> None:

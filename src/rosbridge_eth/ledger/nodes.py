@@ -14,6 +14,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,8 @@ START_SECONDS = 60.0  # the first start downloads it
 STOP_SECONDS = 10.0
 SAVE_SECONDS = 5.0  # between two looks whether there is something to save
 SAVE_SHARE = 20  # of the time at most so little is spent on saving
+_WITH_US = 'exec 3<&0; { read -r _ <&3; kill -KILL 0; } & exec "$@" </dev/null 3<&-'
+"""Runs a program until its input, a pipe that nobody writes to, is closed; then all of its group is killed."""
 TOLD_FROM = 256 * 2**20  # bytes of state that are worth a warning, and every doubling of it
 
 
@@ -106,7 +109,8 @@ class Anvil:
 
     Where it has a state file, the chain survives. anvil itself would write the file in place, again and again; here it
     is asked for its state and the file exchanged for a new one, so that what is there is whole at every moment.
-    A kill costs what came since the last time: 5 s, or twenty times as long as writing takes.
+    A kill costs what came since the last time: 5 s, or twenty times as long as writing takes. It ends with the process
+    that started it, also if that one is killed: nobody would save what it has.
     """
 
     def __init__(self, port: int, process: subprocess.Popen[bytes], state: Path | None) -> None:
@@ -149,9 +153,10 @@ class Anvil:
         if block_time is not None:
             command += ["--block-time", f"{block_time:g}"]
         with (log_file.open("ab") if log_file else open(os.devnull, "wb")) as output:
-            process = subprocess.Popen(  # noqa: S603 - a fixed program, no shell
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-            )
+            process = subprocess.Popen(  # noqa: S603 - fixed programs
+                ["/bin/sh", "-c", _WITH_US, "sh", *command], stdin=subprocess.PIPE, stdout=output,
+                stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
         anvil = Anvil(port, process, state)
         deadline = time.monotonic() + START_SECONDS
         while True:
@@ -230,22 +235,22 @@ class Anvil:
             self._saver.join()
             if self.running():
                 self.save()
-        for sent in (signal.SIGINT, signal.SIGKILL):
-            if self.running():
-                self._signal(sent)
+        self._end(signal.SIGINT)
 
     def kill(self) -> None:
         """As a power cut would."""
         self._stopped.set()
-        self._signal(signal.SIGKILL)
+        self._end(signal.SIGKILL)
 
-    def _signal(self, number: signal.Signals) -> None:
-        try:
-            # npx starts anvil as a child of its own: the signal goes to the group that start() made.
-            os.killpg(self._process.pid, number)
-            self._process.wait(STOP_SECONDS)
-        except (ProcessLookupError, subprocess.TimeoutExpired):
-            pass
+    def _end(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError, subprocess.TimeoutExpired):
+            if self.running():
+                # npx starts anvil as a child of its own: the signal goes to the group that start() made.
+                os.killpg(self._process.pid, number)
+                self._process.wait(STOP_SECONDS)
+        if self._process.stdin is not None:
+            self._process.stdin.close()  # and what is left of the group is killed
+        self._process.wait()
 
     def __enter__(self) -> Anvil:
         return self

@@ -31,7 +31,7 @@ import requests
 from requests.adapters import HTTPAdapter
 from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 
-from rosbridge_eth.errors import ChainError
+from rosbridge_eth.errors import ChainError, ConfigError
 
 MAX_ANSWER = 64 * 2**20  # bytes; the events of a full block are a tenth of it
 AT_ONCE = 50  # requests in one HTTP request
@@ -207,13 +207,18 @@ class Node:
     """web3 on a node, without the middleware that asks for the chain id before every call and wraps every answer."""
 
     def __init__(self, where: Any, timeout: float, abi: Sequence[Mapping[str, Any]]) -> None:
-        """where: a URL, or a provider of web3. abi: of the contract whose errors are told by name."""
+        """where: a URL, or a provider of web3. abi: of the contract whose errors are told by name.
+
+        ConfigError where the URL is none of a node.
+        """
         from web3 import HTTPProvider, Web3
         from web3.middleware import ExtraDataToPOAMiddleware
 
         limit_recursion()
         self._abi, self._session, self.url = abi, None, "embedded"
         if isinstance(where, str):
+            if not re.match("https?://[^/]", where):
+                raise ConfigError('this is no URL of a node: write "http://127.0.0.1:8545" or "https://..."')
             self.url, self._session = shown(where), session()
             options = {"timeout": timeout, "allow_redirects": False}
             where = HTTPProvider(where, options, self._session, exception_retry_configuration=None)

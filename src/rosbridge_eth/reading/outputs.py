@@ -416,6 +416,8 @@ def check_picture(path: Path) -> str:
         raise ConfigError(f"{path}: the ending says which kind of picture it is; {_PICTURES}")
     if kind not in FigureCanvasBase.get_supported_filetypes():
         raise ConfigError(f"{path}: a picture cannot be a .{kind} file; {_PICTURES}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path.parent} is no folder; make it first")
     return kind
 
 

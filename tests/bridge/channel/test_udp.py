@@ -159,6 +159,11 @@ def test_a_port_in_use_is_an_error_with_a_way_out(workers):
             server_sockets(("127.0.0.1", port_of(workers)), count)
 
 
+def test_an_address_of_another_machine_is_an_error_with_its_own_way_out():
+    with pytest.raises(NetworkError, match=r"no network interface here has that address; .* 0\.0\.0\.0"):
+        server_sockets(("203.0.113.7", 0))
+
+
 def test_a_name_that_does_not_exist_is_an_error():
     with pytest.raises(NetworkError, match=r"no-such-host\.invalid"):
         client_socket(("no-such-host.invalid", 1))

@@ -210,6 +210,20 @@ def test_the_size_is_known_and_a_large_one_is_told(tmp_path: Path, monkeypatch, 
     assert "use geth" in caplog.text
 
 
+def test_it_ends_with_the_process_that_started_it_also_where_that_is_killed(tmp_path: Path, node: Anvil) -> None:
+    """A chain that nobody saves would be lost at the next power cut, with all that robots believe to be on it."""
+    port = free_port()
+    code = f"from rosbridge_eth.ledger.nodes import Anvil; Anvil.start({port}); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as starter:
+        assert starter.stdout is not None and starter.stdout.readline()
+        assert not nodes.is_free(port)
+        starter.kill()
+    deadline = time.monotonic() + 30
+    while not nodes.is_free(port):
+        assert time.monotonic() < deadline, "it runs on"
+        time.sleep(0.05)
+
+
 def test_a_state_file_that_is_damaged_is_said(tmp_path: Path, node: Anvil):
     (state := tmp_path / "chain.json").write_text('{"blocks": [{"head')
     with pytest.raises(ChainError, match=r"chain\.json is damaged"):

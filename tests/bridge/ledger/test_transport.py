@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.ledger.hostile import HostileNode, http, says
-from rosbridge_eth.errors import ChainError
+from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.ledger.transport import (
     AlreadyKnown,
@@ -277,3 +277,9 @@ def test_access_keys_and_control_characters_are_not_shown():
     assert "secret" not in str(caught.value)
     assert "key" not in str(caught.value)
     assert "refused" in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["nonsense", "file:///etc/passwd", "http://", "127.0.0.1:8545", ""])
+def test_what_is_no_url_of_a_node_is_told_as_that(url: str):
+    with pytest.raises(ConfigError, match="no URL of a node"):
+        Ledger(url, CONTRACT)

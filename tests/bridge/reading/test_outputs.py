@@ -385,6 +385,11 @@ def test_an_ending_that_is_no_picture(tmp_path, name):
         outputs.check_picture(tmp_path / name)
 
 
+def test_a_picture_in_no_folder_is_told_before_anything_is_read(tmp_path):
+    with pytest.raises(ConfigError, match="make it first"):
+        outputs.check_picture(tmp_path / "absent" / "a.png")
+
+
 @pytest.mark.parametrize(("check", "name"), [(outputs.check_bag, "a.doc"), (outputs.check_table, "a.doc")])
 def test_an_ending_that_is_no_bag_or_table(tmp_path, check, name):
     with pytest.raises(ConfigError, match="doc"):
