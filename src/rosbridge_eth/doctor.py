@@ -383,8 +383,8 @@ def session(home: Path, secret: bytes | None) -> Findings:
     yield from monitor(config.monitor, runs)
     if secret is None or runs:
         why = "a session would end that of the robot that runs" if runs else "it takes the robot's keys to be let in"
-        mend = "see `status` of this home" if runs else "give --passphrase-file"
-        yield skipped("server", f"{server} not tried: {why}", mend)
+        way = "see `status` of this home" if runs else "give --passphrase-file"
+        yield skipped("server", f"{server} not tried: {why}", way)
         return
     identity, roots = ids.load_identity(place.identity, secret)
     yield ok("password", f"opens the keys of {identity.name}")

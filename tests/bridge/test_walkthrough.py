@@ -43,7 +43,7 @@ def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, requi
             join.answer("Name of this robot", "")
             join.answer("Messages come from", "sim")
             join.answer("Which, by number, name or pattern", "1, 3")
-            join.until("There is no number 3: the numbers are 1 to 2.")
+            join.until("There is no number 3. The numbers are 1 to 2.")
             join.answer("Which, by number, name or pattern", "/a!")
             join.until("is not a name or pattern")
             join.answer("Which, by number, name or pattern", " 2, ")

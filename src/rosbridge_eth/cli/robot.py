@@ -119,7 +119,7 @@ def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
             return suggested
         words = re.split("[ ,]+", given)
         if absent := [word for word in words if word.isdigit() and word not in numbered]:
-            talk(f"There is no number {', '.join(absent)}: the numbers are 1 to {len(numbered)}.")
+            talk(f"There is no number {', '.join(absent)}. The numbers are 1 to {len(numbered)}.")
             continue
         chosen = list(dict.fromkeys(numbered[word].topic if word in numbered else word for word in words))
         try:
