@@ -136,12 +136,13 @@ class TriggerRule(NamedTuple):
 
 
 class Record(NamedTuple):
-    """A captured line on its way to the writer. definition: as LogWriter.add takes it."""
+    """A captured line on its way to the writer. definition: as LogWriter.add takes it; archive: its `archived`."""
 
     topic: str
     received_ns: int
     line: bytes
     definition: tuple[str, bytes] | None
+    archive: bool = False
 
 
 class Ring:

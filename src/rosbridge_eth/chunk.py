@@ -207,21 +207,29 @@ class Chunk:
         return replace(self, body=b"") if self.header.archived else self
 
     @staticmethod
-    def parse(data: bytes | memoryview) -> Chunk:
+    def parse(data: bytes | bytearray | memoryview) -> Chunk:
         """The chunk whose encoding is exactly `data`, whole or bare; Malformed if there is none.
 
         Nothing is verified: see `verify`.
         """
         if not _FIXED.size <= len(data) <= MAX_ARCHIVED_CHUNK:
             raise Malformed(f"no chunk has {len(data)} bytes")
-        view = memoryview(data)  # so that the body is copied once
-        end = _FIXED.size + view[_FIXED.size - 1] * _GRANT
-        header = Header.parse(bytes(view[:end]))
-        signature, body = (bytes(part) for part in (view[end : end + identity.SIGNATURE_SIZE],
-                                                    view[end + identity.SIGNATURE_SIZE :]))  # fmt: skip
-        if len(signature) != identity.SIGNATURE_SIZE or len(body) not in (0, header.body_length):
+        bare = Chunk.parse_front(data)
+        body = memoryview(data)[len(bare.encoded) :]
+        if len(body) not in (0, bare.header.body_length):
+            raise Malformed(f"{bare.header} does not have {len(data)} bytes")
+        return replace(bare, body=bytes(body))
+
+    @staticmethod
+    def parse_front(data: bytes | bytearray | memoryview) -> Chunk:
+        """The chunk whose encoding begins like this, without its body. Malformed."""
+        if len(data) < _FIXED.size:
+            raise Malformed(f"no chunk has {len(data)} bytes")
+        end = _FIXED.size + data[_FIXED.size - 1] * _GRANT
+        header, signature = Header.parse(bytes(data[:end])), bytes(data[end : end + identity.SIGNATURE_SIZE])
+        if len(signature) != identity.SIGNATURE_SIZE:
             raise Malformed(f"{header} does not have {len(data)} bytes")
-        return Chunk(header, signature, body)
+        return Chunk(header, signature, b"")
 
 
 # Building

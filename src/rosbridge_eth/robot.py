@@ -42,7 +42,7 @@ from smcrypto import __version__, sm2, x509
 log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
-RING = 4096  # raw messages between the source's thread and the loop
+RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread and the loop, and their bytes
 TAKE = 128  # raw messages captured before the network gets its turn again
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
@@ -78,6 +78,7 @@ class Robot:
         self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
         self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
+        self._put = self._taken = 0  # bytes that ever went into the ring, counted by its thread, and out of it
         self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
@@ -158,7 +159,8 @@ class Robot:
                 self.loop.step(self._wait(now, finished))
             else:
                 while (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
-                    self._take(time.monotonic())
+                    self._take(now := time.monotonic())
+                    self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 if not finished:
                     self._finish(time.monotonic())
                 self._last_words()
@@ -186,13 +188,17 @@ class Robot:
             self.loop.wake()
 
     def _emit(self, raw: RawMessage) -> None:
-        while len(self._ring) >= RING and not self._stop.is_set():
+        while self._full() and not self._stop.is_set():
             self._room.clear()
-            if len(self._ring) >= RING:
+            if self._full():
                 self._room.wait(0.2)
+        self._put += len(raw.raw)
         self._ring.append(raw)
         if len(self._ring) == 1:
             self.loop.wake()
+
+    def _full(self, share: int = 1) -> bool:
+        return len(self._ring) >= RING // share or self._put - self._taken >= RING_BYTES // share
 
     # The loop's thread
 
@@ -200,7 +206,7 @@ class Robot:
         if now - self._synchronised_at > SYNCHRONISED_EVERY:
             self._synchronised, self._synchronised_at = clock_synchronised(), now
         for _ in range(TAKE):
-            if len(self._unspooled) >= MAX_UNSPOOLED:
+            if len(self._unspooled) >= MAX_UNSPOOLED or self.writer.next_timer() <= now:
                 break
             if self.box.released:  # before anything new, so that no more is kept than was stated
                 self._write(self.box.released.popleft(), now)
@@ -208,25 +214,27 @@ class Robot:
                 self._capture(self._ring.popleft(), now)
             else:
                 break
-        if len(self._ring) < RING // 2:
+        if not self._full(2):
             self._room.set()
         if now - self._losses_at >= LOSSES_EVERY:
             self._losses_at = now
             self._add_losses(now)
 
     def _capture(self, raw: RawMessage, now: float) -> None:
+        self._taken += len(raw.raw)
         self.box.look(raw)
         captured = self.capture.process(raw, time.time_ns(), self._synchronised)
         if captured is None:
             return
-        record = Record(raw.topic, raw.received_ns, captured.line, (raw.type_name, definition_line(raw.decoder)))
+        definition = raw.type_name, definition_line(raw.decoder)
+        record = Record(raw.topic, raw.received_ns, captured.line, definition, captured.archive)
         if captured.trigger is None:
             self._write(record, now)
         else:
             self.box.keep(captured.trigger, record)
 
     def _write(self, record: Record, now: float) -> None:
-        self.writer.add(record.line, now, record.definition, topic=record.topic)
+        self.writer.add(record.line, now, record.definition, topic=record.topic, archived=record.archive)
         if record.definition is not None:  # else it is no message
             self.written[record.topic] += 1
 

@@ -13,13 +13,15 @@ from dataclasses import dataclass
 
 from rosbridge_eth import protocol
 from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason
+from rosbridge_eth.chunk import MAX_CHUNK
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
+from rosbridge_eth.protocol import MAX_PART, Confirmed, Have, Hold, Offer, Part, ProtocolError, Refused, Stored, Where
 from rosbridge_eth.spool import Spool
 
 log = logging.getLogger(__name__)
 
 READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
+AHEAD = 8 * 1024 * 1024  # bytes of chunks beyond what the server has stored; no further one is begun then
 SAY_AGAIN = 60.0  # seconds before the same reason for having no session is said once more
 
 
@@ -73,11 +75,14 @@ class Sender:
         self._on_server_time = on_server_time
         self.begin_stream: Callable[[bytes], None] = lambda refused: None
         """Called when the server refused a stream, which may be the one that is being written."""
-        self._said: dict[str, float] = {}  # reason for having no session -> when it was said
+        self._said: dict[str, float] = {}  # reason for having no session, or for a hold -> when it was said
         self._stream: bytes | None = None  # being sent; None: the next one is to be asked about
         self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
         self._stored: int | None = None  # the newest number of it that the server has
         self._asked = False  # a question is out, or a hold is on: nothing is sent until the next Stored
+        self._flying: dict[int, int] = {}  # number of each chunk above `_stored` that was begun -> its bytes
+        self._parts: tuple[memoryview, int] | None = None  # of the chunk that is sent in parts, and what is sent of it
+        self._have = Have(b"", 0)  # what the server said it has of a chunk
         self.statistics = SenderStatistics()
 
     @property
@@ -92,24 +97,47 @@ class Sender:
         if self._stream is None:
             self._ask(self._spool.first_unconfirmed(), now)
             return
-        if not self._client.writable(now):
+        if not self._client.writable(now) or not self._send_parts(now) or sum(self._flying.values()) > AHEAD:
             return
         for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
-            message = protocol.encode(Offer(chunk.encoded))
-            if not self._client.writable(now, len(message)):
+            encoded, number = chunk.encoded, chunk.header.number
+            if len(encoded) > MAX_CHUNK:
+                self._parts = memoryview(encoded), self._have.size if chunk.header.digest == self._have.digest else 0
+            elif not self._put(Offer(encoded), now):
                 return
-            self._client.send(message)
-            self._sent = chunk.header.number
+            self._sent, self._flying[number] = number, len(encoded)
             self.statistics.sent += 1
-            self._client.expecting(True)
+            if not self._send_parts(now):
+                return
         if self._sent == self._stored:
             self._ask(self._spool.next_stream(self._stream), now)
+
+    def _send_parts(self, now: float) -> bool:
+        """Send what is left of a chunk that goes in parts; whether nothing is."""
+        while self._parts is not None:
+            encoded, at = self._parts
+            end = min(at + MAX_PART, len(encoded))
+            if not self._put(Part(at, len(encoded), encoded[at:end]), now):
+                return False
+            self._parts = None if end == len(encoded) else (encoded, end)
+        return True
+
+    def _put(self, message: Offer | Part, now: float) -> bool:
+        """Send it, if there is room."""
+        encoded = protocol.encode(message)
+        if not self._client.writable(now, len(encoded)):
+            return False
+        self._client.send(encoded)
+        self._client.expecting(True)
+        return True
 
     def _ask(self, place: tuple[bytes, int, bytes] | None, now: float) -> None:
         question = None if place is None else protocol.encode(Where(*place))
         if place is not None and question is not None and self._client.writable(now, len(question)):
             self._client.send(question)
             self._stream, self._sent, self._stored, self._asked = place[0], None, None, True
+            self._parts, self._have = None, Have(b"", 0)
+            self._flying.clear()
             self._client.expecting(True)
 
     def handle(self, event: Event, now: float) -> None:
@@ -133,14 +161,16 @@ class Sender:
                     log.warning("no session: %s", self.statistics.refusal)
             case Message(payload=payload):
                 try:
-                    self._take(protocol.decode_down(payload))
+                    self._take(protocol.decode_down(payload), now)
                 except ProtocolError as error:  # nothing is lost: what is not confirmed is in the spool
                     raise NetworkError(
                         f"the server says what is no message here ({error}); use the same version on both ends"
                     ) from error
 
-    def _take(self, message: Stored | Confirmed | Hold | Refused) -> None:
+    def _take(self, message: protocol.Down, now: float) -> None:
         match message:
+            case Have():
+                self._have = message
             case Stored() if self.statistics.held is not None:  # it takes chunks again: ask from the beginning
                 self._stream, self._asked, self.statistics.held = None, False, None
             case Stored(stream=stream, number=number) if stream == self._stream:
@@ -148,6 +178,7 @@ class Sender:
                     self._sent, self._asked = number, False
                 self._stored = number
                 if number is not None:
+                    self._flying = {above: size for above, size in self._flying.items() if above > number}
                     self._spool.stored(stream, number)
                     self._client.progressed()
                 self._client.expecting(self._sent != self._stored)
@@ -159,7 +190,9 @@ class Sender:
             case Hold(why=why):
                 self._asked, self.statistics.held = True, why
                 self._client.expecting(False)
-                log.warning("the server takes nothing at this moment: %s", why)
+                if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:
+                    self._said[why] = now
+                    log.warning("the server takes nothing at this moment: %s", why)
             case Refused(stream=stream, number=number, why=why):
                 aside = self._spool.set_aside(stream, number)
                 self.statistics.refused += aside

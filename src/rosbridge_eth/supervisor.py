@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 
 from rosbridge_eth import metrics
 from rosbridge_eth.administration import server_trust
+from rosbridge_eth.archive import open_archive
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
@@ -55,7 +56,7 @@ GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
 PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
 """Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
 
-TAKEN_UP = ("channel", "chain", "store", "funds", "limits")
+TAKEN_UP = ("channel", "chain", "store", "archive", "funds", "limits")
 """Keys of server.toml that SIGHUP takes up: those that the parent, its sockets and certificates do not rest on."""
 
 SUBMITTER, MONITOR = "submitter", "monitor"
@@ -111,7 +112,10 @@ def open_reception(
         found = registry.find(Role.ROBOT, name)
         return None if found is None else found.hash
 
-    return Reception(server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates)
+    archive = None if config.archive is None else open_archive(config.archive)
+    return Reception(
+        server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates, archive=archive
+    )
 
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import orjson
 
 from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
-from rosbridge_eth.capture.lines import MAX_LINE, lost_line
+from rosbridge_eth.capture.lines import MAX_ARCHIVED_LINE, MAX_LINE, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
 from rosbridge_eth.capture.rules import NamePattern, Schedule, Selection, TopicRule, parse_paths, rule_for
 from rosbridge_eth.errors import ConfigError
@@ -43,7 +43,7 @@ _LOSSES: Final = frozenset(Cause) - {Cause.FIELD_DIGESTED}
 
 
 class Captured(NamedTuple):
-    """What became of a message: `line` is the record; data is JSON-ready, see conversion; trigger as in its rule."""
+    """What became of a message: `line` is the record; data is JSON-ready, see conversion; the rest as in its rule."""
 
     topic: str
     type_name: str
@@ -52,6 +52,7 @@ class Captured(NamedTuple):
     decoder: Decoder
     data: dict[str, Any]
     trigger: str | None = None
+    archive: bool = False
 
 
 @dataclass
@@ -118,15 +119,16 @@ class Capture:
             "topic": raw.topic, "type": raw.type_name, "source": self._source_kind,
             "received_ns": raw.received_ns, "captured_ns": wall_ns, "clock": clock_synchronised, "data": data,
         })  # fmt: skip
-        if len(line) > MAX_LINE:
-            why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
+        if len(line) > (most := MAX_ARCHIVED_LINE if topic.rule.archive else MAX_LINE):
+            why = f"its fields come to more than {most} bytes of JSON; choose fewer fields"
             return self._left_out(raw, Cause.RECORD_TOO_LARGE, why)
         if conversion.digested > digested_before:
             text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
             self._count(raw.topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
         topic.schedule.captured(raw.received_ns)
         self.counts[raw.topic, "captured"] += 1
-        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data, topic.rule.trigger)
+        rest = topic.rule.trigger, topic.rule.archive
+        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data, *rest)
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if the topic's rule does not fit the type."""

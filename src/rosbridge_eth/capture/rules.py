@@ -23,6 +23,8 @@ from typing import Final, Literal, TypeAlias
 OversizePolicy: TypeAlias = Literal["digest", "refuse"]
 DEFAULT_LIMIT: Final = 16 * 1024
 """Bytes of one field from which on its digest stands for it."""
+ARCHIVE_LIMIT: Final = 12_000_000
+"""The same where records are archived: in base64, with other fields, it fits a line."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class TopicRule:
     for_ns: length of the period: from `from_ns`, or from the first message if that is None.
     oversize, limit: what becomes of a field above `limit` bytes.
     trigger: records are kept in memory until this event; None: they are written.
+    archive: the records go into chunks for the archive, and may be as long as fits one.
     """
 
     topic: str
@@ -51,6 +54,7 @@ class TopicRule:
     oversize: OversizePolicy = "digest"
     limit: int = DEFAULT_LIMIT
     trigger: str | None = None
+    archive: bool = False
 
 
 class Schedule:

@@ -11,13 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, WithJsonSchema
+from pydantic import (  # isort: skip
+    AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, ValidationInfo, WithJsonSchema,
+)  # fmt: skip
 from pydantic import model_validator as validator
 
 from rosbridge_eth.blackbox import Condition, TriggerRule
 from rosbridge_eth.capture import NamePattern, TopicRule
-from rosbridge_eth.capture.rules import parse_paths
-from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
+from rosbridge_eth.capture.rules import ARCHIVE_LIMIT, parse_paths
+from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size, to_path
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of
 
@@ -82,6 +84,7 @@ Pattern = Annotated[str, AfterValidator(_pattern)]
 FieldPath = Annotated[str, AfterValidator(_field_path)]
 Speed = Annotated[float | None, BeforeValidator(_speed), WithJsonSchema({"type": 'number or `"max"`'})]
 Mode = Literal["exchange", "transport"]
+Store = Literal["chain", "archive"]
 Name = Annotated[str, _matching(
     r"[a-z0-9][a-z0-9_.\-]{0,62}", "a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")]
 MasterUri = Annotated[str, _matching(
@@ -99,8 +102,41 @@ NodeUrl = Annotated[str, _matching(
     'a node\'s URL; write "http://127.0.0.1:8545" or "https://..."', secret=True)]
 StoreUrl = Annotated[str, _matching(
     r"sqlite|rediss?://\S+|unix://\S+", 'a store; write "sqlite" or "redis://127.0.0.1:6379/0"', secret=True)]
+_S3_URL = re.compile(r"s3://[a-z0-9][a-z0-9.\-]{1,61}[a-z0-9](?:/[\w.\-/]*)?", re.ASCII)
+
+
+def _archive_url(value: Any, info: ValidationInfo) -> str | Path:
+    if not isinstance(value, str) or "://" not in value:
+        return to_path(value, info)
+    if not _S3_URL.fullmatch(value):
+        raise ValueError('is no archive; write a folder, "s3://BUCKET" or "s3://BUCKET/PREFIX"; keys stand elsewhere')
+    return value
+
+
+ArchiveUrl = Annotated[str | Path, BeforeValidator(_archive_url), WithJsonSchema({"type": "folder or S3 URL"})]
 ContractAddress = Annotated[str, _matching("0x[0-9a-fA-F]{40}", "an address is 0x and 40 hexadecimal digits")]
 Hash = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexadecimal digits")]
+
+
+class ArchiveConfig(Section):
+    """The archive: where the bodies of archived chunks rest (docs/howto-archive.md). Without it there is none.
+
+    url: A folder, or `"s3://BUCKET/PREFIX"`.
+
+    endpoint: URL of the store, where that is not Amazon's; without it, `AWS_ENDPOINT_URL` of the environment.
+
+    region: The bucket's region; without it, `AWS_REGION` of the environment.
+
+    keys: A file with the access key id and the secret access key, which only its owner may read; without it, those of
+    the environment (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`), or of the machine's role.
+    """
+
+    url: ArchiveUrl
+    endpoint: Annotated[str, _matching(
+        rf"https?://{_HOST}(?::\d{{1,5}})?/?", 'write a URL without keys, such as "https://s3.example.org:9000"',
+        secret=True)] | None = None
+    region: str | None = None
+    keys: FilePath | None = None
 
 
 # The robot
@@ -127,6 +163,8 @@ class TopicConfig(Section):
     for: Length of the period, from `from` or from the first message.
 
     trigger: The name of a `[[trigger]]`: records are kept in memory and go into the log only when that happens.
+
+    store: Where its records go, as in `[capture]`; without it, where that says.
     """
 
     topic: Pattern
@@ -138,6 +176,7 @@ class TopicConfig(Section):
     until: TimeNs | None = None
     for_: DurationNs | None = Field(default=None, alias="for")
     trigger: Name | None = None
+    store: Store | None = None
 
     @validator(mode="after")
     def _consistent(self) -> TopicConfig:
@@ -184,11 +223,15 @@ class CaptureConfig(Section):
     oversize: What becomes of a field above `field_limit`: its SM3 digest and length are captured instead, or the
     message is left out, which the log says. Both are counted, and said once per topic.
 
-    field_limit: Largest field that is captured as it is.
+    field_limit: Largest field that is captured as it is; of what goes into the archive that is always 12 MB.
+
+    store: Where records go: onto the chain, or into the operator's archive, with header and signature of their chunks
+    on the chain (docs/howto-archive.md). That is for images and point clouds.
     """
 
     oversize: Literal["digest", "refuse"] = "digest"
     field_limit: Annotated[int, size(high="48 KiB")] = 16 * KIB
+    store: Store = "chain"
 
 
 class BagConfig(Section):
@@ -362,6 +405,8 @@ class RobotConfig(Section):
     def _consistent(self) -> RobotConfig:
         if not self.topics and not self.nodes:
             raise ValueError('names nothing to watch; write topics = ["/robot_1/odom"] or nodes = ["/robot_1/base"]')
+        if self.spool.max_size < 64 * MIB and any(rule.archive for rule in self.rules()):
+            raise ValueError('has a topic with store = "archive": [spool] max_size should be at least "64 MiB"')
         names = [topic.topic for topic in self.topics]
         if twice := [name for number, name in enumerate(names) if name in names[:number]]:
             raise ValueError(f"names topic {twice[0]} twice")
@@ -398,9 +443,11 @@ class RobotConfig(Section):
         return [
             TopicRule(
                 topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
-                topic.for_, self.capture.oversize, self.capture.field_limit, topic.trigger,
+                topic.for_, self.capture.oversize, ARCHIVE_LIMIT if archive else self.capture.field_limit,
+                topic.trigger, archive,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
+            for archive in [(topic.store or self.capture.store) == "archive"]
         ]
 
     def source_and_why(self, environment: Mapping[str, str]) -> tuple[AnySource, str]:
@@ -531,6 +578,8 @@ class ServerConfig(Section):
 
     store: The inbox (below).
 
+    archive: Where the bodies of archived chunks rest (below).
+
     funds: Robots' accounts (below).
 
     limits: Bounds (below).
@@ -545,6 +594,7 @@ class ServerConfig(Section):
     passphrase_file: FilePath | None = None
     chain: ChainConfig = ChainConfig()
     store: StoreConfig = StoreConfig()
+    archive: ArchiveConfig | None = None
     funds: FundsConfig = FundsConfig()
     limits: LimitsConfig = LimitsConfig()
 
@@ -577,6 +627,8 @@ class ReaderConfig(Section):
 
     chain: JSON-RPC URL of a node of the chain, or a list of them: all are asked, the highest count holds, and where
     they disagree it is told.
+
+    archive: Where the bodies of archived chunks are (below).
     """
 
     contract: ContractAddress
@@ -587,6 +639,7 @@ class ReaderConfig(Section):
     chain: Annotated[list[NodeUrl], BeforeValidator(_listed)] = Field(
         default=["http://127.0.0.1:8545"], min_length=1, repr=False
     )
+    archive: ArchiveConfig | None = None
 
     @property
     def ledger(self) -> bytes:

@@ -138,7 +138,8 @@ def size(low: str = "1 B", high: str = "") -> Written:
     return Written("size", parse_size, low, high)
 
 
-def _path(value: Any, info: ValidationInfo) -> Path:
+def to_path(value: Any, info: ValidationInfo) -> Path:
+    """A relative path starts at the folder of the configuration file."""
     if not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"is {value!r}; write a path in quotes")
     folder = info.context.get("folder") if info.context else None
@@ -149,5 +150,5 @@ def _path(value: Any, info: ValidationInfo) -> Path:
 DurationNs = Annotated[int, Written("duration", parse_duration)]
 TimeNs = Annotated[int, Written("time", parse_time)]
 HostPort = Annotated[Address, Written("address", parse_address)]
-FilePath = Annotated[Path, BeforeValidator(_path), WithJsonSchema({"type": "path"})]
+FilePath = Annotated[Path, BeforeValidator(to_path), WithJsonSchema({"type": "path"})]
 """A relative path starts at the folder of the configuration file."""

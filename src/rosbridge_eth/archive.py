@@ -1,0 +1,155 @@
+"""Where the bodies of archived chunks rest: a folder, or a bucket of a store that speaks S3.
+
+An object is a body and nothing else, and is named by its digest, ab/ab… (64 hex digits): putting it again changes
+nothing, and a folder can be copied into a bucket. What is put is durable on return. An archive keeps what it is given
+and proves nothing: whoever reads a body holds it against its digest.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from rosbridge_eth.errors import ConfigError, StoreError
+from rosbridge_eth.files import read_file, write_atomically
+from rosbridge_eth.logs import one_line
+from smcrypto import sm3
+
+if TYPE_CHECKING:
+    from rosbridge_eth.config.models import ArchiveConfig
+
+S3: Final = "s3://"
+_CONNECT_TIME, _TIME = timedelta(seconds=5), timedelta(seconds=60)
+_PROBE: Final = b"rosbridge-eth: whether this archive can be written and read\n"
+
+
+class Archive(Protocol):
+    """Every method may raise StoreError: the archive is away, or refuses."""
+
+    def put(self, digest: bytes, body: bytes) -> None:
+        """Keep a body."""
+
+    def get(self, digest: bytes, length: int) -> bytes | None:
+        """What is there by this name, cut off one byte behind `length`; None where nothing is."""
+
+    def delete(self, digest: bytes) -> None:
+        """Remove it, if it is there."""
+
+    def check(self) -> bytes:
+        """Put an object and read it; its digest, which is always the same: where nothing is deleted it stays one."""
+        digest = sm3.digest(_PROBE)
+        self.put(digest, _PROBE)
+        if self.get(digest, len(_PROBE)) != _PROBE:
+            raise StoreError(f"{self} does not give back what it was given")
+        return digest
+
+
+class Folder(Archive):
+    """A folder, which is there: one on a disk that is not mounted is not made in its place."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __str__(self) -> str:
+        return f"the archive {self._path}"
+
+    @contextmanager
+    def _using(self, digest: bytes) -> Iterator[Path]:
+        try:
+            if not self._path.is_dir():
+                raise StoreError(f"{self} is not there; mount it, make the folder, or correct [archive] url")
+            yield self._path / _name(digest)
+        except OSError as error:
+            raise StoreError(f"{self} cannot be used: {error.strerror or error}") from error
+
+    def put(self, digest: bytes, body: bytes) -> None:
+        with self._using(digest) as path:
+            if not path.parent.is_dir():
+                path.parent.mkdir(exist_ok=True)
+                folder = os.open(self._path, os.O_RDONLY)
+                try:
+                    os.fsync(folder)
+                finally:
+                    os.close(folder)
+            write_atomically(path, body)
+
+    def get(self, digest: bytes, length: int) -> bytes | None:
+        with self._using(digest) as path:
+            try:
+                with path.open("rb") as file:
+                    return file.read(length + 1)
+            except FileNotFoundError:
+                return None
+
+    def delete(self, digest: bytes) -> None:
+        with self._using(digest) as path:
+            path.unlink(missing_ok=True)
+
+
+class Bucket(Archive):
+    """A bucket, through obstore. Not to be carried over a fork. ConfigError without obstore, or for its keys."""
+
+    def __init__(self, config: ArchiveConfig) -> None:
+        try:
+            import obstore
+            from obstore.store import S3Store
+        except ImportError as error:
+            raise ConfigError("an archive in S3 takes obstore: pip install 'pysmcrypto[bridge,archive]'") from error
+        self._obstore: Any = obstore
+        self._url = str(config.url)
+        bucket, _, prefix = self._url.removeprefix(S3).partition("/")
+        settings = {"endpoint": config.endpoint, "region": config.region}
+        if config.keys is not None:
+            words = read_file(config.keys, private=True).decode("ascii", "replace").split()
+            if len(words) != 2:
+                raise ConfigError(f"{config.keys} holds {len(words)} words; write the access key id and the secret")
+            settings["access_key_id"], settings["secret_access_key"] = words
+        self._store: Any = S3Store(
+            bucket, prefix=prefix or None, config={key: value for key, value in settings.items() if value},  # type: ignore[arg-type]
+            client_options={
+                "connect_timeout": _CONNECT_TIME, "timeout": _TIME,
+                "allow_http": (config.endpoint or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://"),
+            },
+            retry_config={"max_retries": 2, "retry_timeout": _TIME},
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        return f"the archive {self._url}"
+
+    @contextmanager
+    def _using(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, self._obstore.exceptions.BaseError) as error:  # its text goes on for pages
+            text = one_line(str(error).partition("\n")[0])[:300]
+            raise StoreError(f"{self} cannot be used: {text}") from None
+
+    def put(self, digest: bytes, body: bytes) -> None:
+        with self._using():
+            self._obstore.put(self._store, _name(digest), body, use_multipart=False)
+
+    def get(self, digest: bytes, length: int) -> bytes | None:
+        with self._using():
+            try:
+                return bytes(self._obstore.get_range(self._store, _name(digest), start=0, length=length + 1))
+            except FileNotFoundError as error:
+                if "NoSuchBucket" in str(error):  # nothing is known of what it holds
+                    raise
+                return None
+
+    def delete(self, digest: bytes) -> None:
+        with self._using():
+            self._obstore.delete(self._store, _name(digest))
+
+
+def open_archive(config: ArchiveConfig) -> Archive:
+    """The archive that the configuration names; nothing is asked of it yet."""
+    return Folder(config.url) if isinstance(config.url, Path) else Bucket(config)
+
+
+def _name(digest: bytes) -> str:
+    return f"{digest.hex()[:2]}/{digest.hex()}"
