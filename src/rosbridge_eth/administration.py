@@ -76,7 +76,9 @@ def own_address(listen: Address) -> Address:
     return listen._replace(host=loopback)
 
 
-def server_toml(listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None) -> str:
+def server_toml(
+    listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None, archive: str | None
+) -> str:
     """The first server.toml of a home: what differs from the defaults, and where the rest is described."""
     lines = [
         "# Settings of the server; docs/configuration.md describes every key.",
@@ -87,6 +89,7 @@ def server_toml(listen: Address, public: Address, chain_url: str, name: str, pas
         "",
         "[chain]",
         f'url = "{chain_url}"',
+        *(["", "[archive]", f'url = "{archive}"'] if archive else []),
     ]
     return "\n".join(lines) + "\n"
 
@@ -95,25 +98,29 @@ def init_home(
     home: OperatorHome, passphrase: bytes, *, reader: ReaderHome, reader_passphrase: bytes, now: datetime,
     listen: str = "0.0.0.0:7410", public: str | None = None, chain_url: str = "http://127.0.0.1:8545",
     server: str = "server", ca: Path | None = None, ca_passphrase: bytes | None = None, keys: Keyring | None = None,
-    passphrase_file: Path | None = None,
+    passphrase_file: Path | None = None, archive: str | None = None,
 ) -> Keyring:
     """Make an operator's home: CA, server's identity, seed of the accounts; and the reader `owner` in its own folder.
 
     ca: the folder of the CA, which is made there unless it holds one (`ca.key.pem`, `ca.crt.pem`); without it, in the
     home. ca_passphrase: where it differs. keys: instead of a new seed. passphrase_file: is named in server.toml.
+    archive: a folder, which is made, or the URL of a bucket.
     """
     require_empty(home.path)
     require_empty(reader.path)
     try:
         door = parse_address(listen)
         text = server_toml(
-            door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file
+            door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file,
+            str(Path(archive).absolute()) if archive and "://" not in archive else archive,
         )
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
-    parse_config(ServerConfig, text, home.config)
+    named = parse_config(ServerConfig, text, home.config).archive
     if home.path.resolve() == reader.path.resolve():
         raise ConfigError(f"{home.path} cannot be the reader's home as well; choose another folder for one of them")
+    if named is not None and isinstance(named.url, Path):
+        named.url.mkdir(parents=True, exist_ok=True)
     with new_home(home.path), new_home(reader.path):
         for folder in (home.bundles, home.readers):
             folder.mkdir(mode=0o700)
@@ -251,7 +258,7 @@ def deploy_contract(
     write_atomically(home.reader_config, _reader_toml(made, node).encode())
     owner = Path(home_of(home.path)["reader"])
     if (owner / "home.json").exists():  # it may have been carried away
-        shutil.copy(home.reader_config, ReaderHome(owner).config)
+        _give_reader_toml(home, ReaderHome(owner))
     return made
 
 
@@ -268,6 +275,15 @@ def _reader_toml(ledger: Deployment, node: str) -> str:
 
 
 # Readers
+
+
+def _give_reader_toml(home: OperatorHome, reader: ReaderHome) -> None:
+    """What all readers are told, and where the archive is as server.toml has it now; its keys are not theirs."""
+    archive, text = load_server_config(home.config).archive, home.reader_config.read_text(encoding="utf-8")
+    if archive is not None:
+        told = {"url": archive.url, "endpoint": archive.endpoint, "region": archive.region}
+        text += "\n[archive]\n" + "".join(f'{key} = "{value}"\n' for key, value in told.items() if value)
+    write_atomically(reader.config, text.encode())
 
 
 def add_reader(
@@ -295,7 +311,7 @@ def _make_reader(
     ids.save_identity(reader.path, identity, [ca.certificate], passphrase)
     write_atomically(reader.public, identity.public.pem)
     if home.reader_config.exists():
-        shutil.copy(home.reader_config, reader.config)
+        _give_reader_toml(home, reader)
     registry.enrol(identity.public, now, replace=replace)
     write_atomically(home.readers / f"{name}.pem", identity.public.pem)
     make_home(reader.path, HomeKind.READER, name=name)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 S3: Final = "s3://"
 _CONNECT_TIME, _TIME = timedelta(seconds=5), timedelta(seconds=60)
-_PROBE: Final = b"rosbridge-eth: whether this archive can be written and read\n"
+PROBE: Final = b"rosbridge-eth: whether this archive can be written and read\n"
 
 
 class Archive(Protocol):
@@ -41,9 +41,9 @@ class Archive(Protocol):
 
     def check(self) -> bytes:
         """Put an object and read it; its digest, which is always the same: where nothing is deleted it stays one."""
-        digest = sm3.digest(_PROBE)
-        self.put(digest, _PROBE)
-        if self.get(digest, len(_PROBE)) != _PROBE:
+        digest = sm3.digest(PROBE)
+        self.put(digest, PROBE)
+        if self.get(digest, len(PROBE)) != PROBE:
             raise StoreError(f"{self} does not give back what it was given")
         return digest
 

@@ -28,7 +28,7 @@ from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.database import InUse, NothingThere
-from rosbridge_eth.errors import BridgeError, NetworkError
+from rosbridge_eth.errors import BridgeError, NetworkError, StoreError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
@@ -293,6 +293,32 @@ def store(home: Path, secret: bytes | None) -> Findings:
             yield note("dead letters", f"{len(dead)}, the last: {dead[0].why}", "docs/operations.md, Dead letters")
 
 
+def archive(home: Path, secret: bytes | None) -> Findings:
+    """The operator's archive keeps an object and gives it back."""
+    from rosbridge_eth.archive import open_archive
+
+    config = load_server_config(OperatorHome(home).config).archive
+    if config is None:
+        return
+    opened = open_archive(config)
+    digest = opened.check()
+    try:
+        opened.delete(digest)
+        yield ok("archive", f"{opened} was written, read and cleared again")
+    except StoreError as error:
+        yield note("archive", f"written and read; {error}", "one small object stays; nothing else is ever deleted")
+
+
+def readers_archive(home: Path, secret: bytes | None) -> Findings:
+    from rosbridge_eth.archive import open_archive
+
+    config = load_reader_config(ReaderHome(home).config).archive
+    if config is not None:
+        opened = open_archive(config)
+        opened.get(bytes(32), 0)
+        yield ok("archive", f"{opened} answers")
+
+
 def operator_node(home: Path, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.ledger.contract import WEI_PER_ETH
@@ -435,13 +461,14 @@ CHECKS: dict[HomeKind, dict[str, Check]] = {
         "server's certificates": lambda home, _: certificates(
             home / "server", f"run `renew --home {home}`, then start the server again"),
         "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
+        "archive": archive,
         "node": operator_node,
     },
     HomeKind.ROBOT: _MACHINE | {
         "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
         "server": session,
     },
-    HomeKind.READER: _MACHINE | {"keys": reader_keys, "node": reader_nodes},
+    HomeKind.READER: _MACHINE | {"keys": reader_keys, "node": reader_nodes, "archive": readers_archive},
 }  # fmt: skip
 
 

@@ -98,7 +98,7 @@ class Reception:
         self._archive, self._threads = archive, ThreadPoolExecutor(PUTS, "archive")  # which starts them when needed
         self._arriving: dict[bytes, Arriving] = {}  # by Tk; outlives a session, so that the next one goes on with it
         self._puts: list[tuple[bytes, Future[None], int]] = []  # Tk, work that may be going on, bytes
-        self._probe: Future[bytes] | None = None  # whether the archive is well again
+        self._probe = None if archive is None else self._threads.submit(archive.check)
         self.archive_trouble = Trouble(log, "the archive")
         self.server, self._inbox, self._ledger = server, inbox, ledger
         self._allowed, self._certificates = allowed, certificates
@@ -270,13 +270,12 @@ class Reception:
         return ready
 
     def _look_at_archive(self) -> None:
-        """Whether an archive that was away is well again: it is tried by a thread."""
-        if self._archive is not None and self.archive_trouble.why is not None:
-            if self._probe is not None and self._probe.done():
-                error, self._probe = self._probe.exception(), None
-                self.archive_trouble.now(None if error is None else str(error))
-            elif self._probe is None:
-                self._probe = self._threads.submit(self._archive.check)
+        """Whether the archive works at the start, and whether one that was away is well again: a thread tries it."""
+        if self._probe is not None and self._probe.done():
+            error, self._probe = self._probe.exception(), None
+            self.archive_trouble.now(None if error is None else str(error))
+        elif self._probe is None and self._archive is not None and self.archive_trouble.why is not None:
+            self._probe = self._threads.submit(self._archive.check)
 
     def close(self) -> None:
         """End the threads; what they have not put is sent again."""

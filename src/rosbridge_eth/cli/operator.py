@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
 _ReplaceOption = Annotated[bool, typer.Option("--replace", help="Take a used name over; the old one ends.")]
+_ArchiveOption = Annotated[
+    str | None, typer.Option(help="Where images and clouds rest: a folder, which is made, or s3://BUCKET/PREFIX.")]
 _CompromisedOption = Annotated[
     bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
 
@@ -95,7 +97,7 @@ def up(
     chain: Annotated[str | None, typer.Option(help="A node of yours; without it, an anvil kept in the home.")] = None,
     listen: Annotated[str | None, typer.Option(help="UDP address of the robots' door: 0.0.0.0:7410.")] = None,
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
-    passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
+    archive: _ArchiveOption = None, passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
     """Everything an operator runs, in one: home, local chain, contract, server. For trying out and for small sites.
@@ -113,15 +115,19 @@ def up(
         keys = init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
             listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
-            passphrase_file=passphrase_file,
+            passphrase_file=passphrase_file, archive=archive,
         )
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
         place = OperatorHome(home)
     else:
         place, secret, keys = _opened(home, passphrase_file)
         known = load_server_config(place.config)
+        bodies = None if known.archive is None else known.archive.url
+        if archive is not None and "://" not in archive:
+            archive = str(Path(archive).absolute())
         for key, given, now in (
-            ("listen", listen, known.listen), ("public", public, known.public), ("[chain] url", chain, known.chain.url)
+            ("listen", listen, known.listen), ("public", public, known.public), ("[chain] url", chain, known.chain.url),
+            ("[archive] url", archive, bodies),
         ):
             if given not in (None, str(now)):
                 raise ConfigError(f"{place.config} has another address than the option: change {key} there")
@@ -168,6 +174,7 @@ def init(
     server_name: Annotated[str, typer.Option(help="The name in the server's certificate.")] = "server",
     ca: Annotated[Path | None, typer.Option(help="Keep the CA in this folder, or use the one that is there.")] = None,
     mnemonic_file: Annotated[Path | None, typer.Option(help="Restore the accounts from these words.")] = None,
+    archive: _ArchiveOption = None,
     passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
@@ -184,7 +191,7 @@ def init(
         public=public, chain_url=chain, server=server_name, ca=ca,
         ca_passphrase=None if ca_passphrase_file is None
         else read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file),
-        keys=None if words is None else Keyring.from_mnemonic(words),
+        keys=None if words is None else Keyring.from_mnemonic(words), archive=archive,
     )  # fmt: skip
     talk(f"{home} is an operator's home. Keep its passphrase: nothing in it can be recovered without.")
     talk(f"{reader} is the home of the reader `owner`: carry it to the machine that reads; {home} opens no record.")

@@ -24,9 +24,11 @@ from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
 
 if TYPE_CHECKING:
+    from rosbridge_eth.config import ReaderConfig
     from rosbridge_eth.identity import Identity, Trust
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading
+    from rosbridge_eth.reading.verify import Bodies
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -54,6 +56,10 @@ At: TypeAlias = Annotated[
 ]
 Nodes: TypeAlias = Annotated[
     list[str] | None, typer.Option("--node", help="Ask these nodes, not those of reader.toml.")
+]
+ArchiveUrl: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--archive", help="Fetch archived bodies there, not where reader.toml says: folder, s3://…, or `no`."),
 ]
 Confirmations: TypeAlias = Annotated[
     int, typer.Option(min=1, max=100_000, help="Read up to the block that has so many, itself counted.")
@@ -106,6 +112,7 @@ def read(
         str | None, typer.Option(metavar="[HOST:]PORT", help="With --follow: show it on a page, on this machine.")
     ] = None,
     node: Nodes = None,
+    archive: ArchiveUrl = None,
     confirmations: Confirmations = 1,
     confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
@@ -143,11 +150,13 @@ def read(
         records: Iterator[tuple[str, ProvenRecord]]
         if follow:
             records, said = stack.enter_context(
-                _following(place, robot, node, confirmations, confirm, passphrase_file, choice, address, turns)
+                _following(place, robot, node, archive, confirmations, confirm, passphrase_file, choice, address, turns)
             )
         else:
             [name] = robot
-            reading, of_it = stack.enter_context(_reading(place, name, node, confirmations, confirm, passphrase_file))
+            reading, of_it = stack.enter_context(
+                _reading(place, name, node, archive, confirmations, confirm, passphrase_file)
+            )
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
         made = None if bag is None else files.enter_context(outputs.bag(bag, grows=follow))
@@ -191,6 +200,7 @@ def compare(
         bool, typer.Option("--some", help="The robot captures only some messages: those it does not are no difference.")
     ] = False,
     node: Nodes = None,
+    archive: ArchiveUrl = None,
     confirmations: Confirmations = 1,
     confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
@@ -204,7 +214,7 @@ def compare(
 
     place = ReaderHome(home).require()
     choice = comparing.time_of(bag)
-    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+    with _reading(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
         made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
         said |= asdict(made)
     if json:
@@ -230,6 +240,7 @@ def evidence(
     to: To = None,
     at: At = None,
     node: Nodes = None,
+    archive: ArchiveUrl = None,
     confirmations: Confirmations = 1,
     confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
@@ -247,7 +258,7 @@ def evidence(
     if file.exists() or not file.parent.is_dir():
         raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
     place = ReaderHome(home).require()
-    with _reading(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+    with _reading(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
         records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
         for _ in reading.chunks:
             continue  # the verdict is on all of the log
@@ -294,6 +305,21 @@ def verify(
         talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
 
 
+def _bodies(config: ReaderConfig, given: str | None) -> Bodies | None:
+    """What gives the bodies of archived chunks: the archive that was given or that of reader.toml, or nothing."""
+    from rosbridge_eth.archive import open_archive
+    from rosbridge_eth.config.models import ArchiveConfig
+
+    archive = config.archive
+    if given is not None and given != "no":
+        try:
+            named = ArchiveConfig.model_validate({"url": given})
+        except ValueError as error:
+            raise typer.BadParameter(f"{given!r} is no archive", param_hint="--archive") from error
+        archive = named if archive is None else archive.model_copy(update={"url": named.url})
+    return None if archive is None or given == "no" else open_archive(archive).get
+
+
 class _Asked(NamedTuple):
     """Who reads, with what. read: `read_robot` that wants to know only whose log, when, and behind what."""
 
@@ -306,7 +332,7 @@ class _Asked(NamedTuple):
 
 @contextmanager
 def _asking(
-    place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
+    place: ReaderHome, nodes: Sequence[str] | None, archive: str | None, confirmations: int, file: Path | None
 ) -> Iterator[_Asked]:
     from rosbridge_eth.identity import Trust, load_identity
     from rosbridge_eth.ledger import Ledger
@@ -318,12 +344,13 @@ def _asking(
     trust = Trust(roots)
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
     bookmarks = Bookmarks(place.path / "bookmarks.json")
+    bodies = _bodies(config, archive)
     granted = open_folder(place.grants, ledger=config.ledger, reader=identity, trust=trust)
 
     def read(robot: str, **more: Any) -> Reading:
         return read_robot(
             ledgers, robot, trust=trust, reader=identity.encryption_key, bookmarks=bookmarks,
-            granted=granted.get(robot), cache=place.path / "proven", confirmations=confirmations, **more,
+            granted=granted.get(robot), cache=place.path / "proven", confirmations=confirmations, bodies=bodies, **more,
         )  # fmt: skip
 
     with ExitStack() as stack:
@@ -340,6 +367,7 @@ def grant(
     out: Annotated[Path | None, typer.Option(help="The file to write; ROBOT-NAME.grant without it.")] = None,
     home: ReaderHomeOption = READER_HOME,
     node: Nodes = None,
+    archive: ArchiveUrl = None,
     confirmations: Confirmations = 1,
     confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
@@ -356,7 +384,7 @@ def grant(
     known = place.path / "readers" / f"{reader}.pem"
     peer = public_identity(read_given(known if known.exists() else Path(reader)))
     now = datetime.now(UTC)
-    with _asking(place, node, confirmations, passphrase_file) as asked:
+    with _asking(place, node, archive, confirmations, passphrase_file) as asked:
         certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
         peer = asked.trust.check(*certificates, role=Role.READER, at=now)
         out = out or Path(f"{robot}-{peer.name}.grant")
@@ -379,9 +407,10 @@ def grant(
 
 @contextmanager
 def _reading(
-    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int, confirm: bool, file: Path | None
+    place: ReaderHome, robot: str, nodes: Sequence[str] | None, archive: str | None, confirmations: int,
+    confirm: bool, file: Path | None,
 ) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    with _asking(place, nodes, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
+    with _asking(place, nodes, archive, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
         yield found
 
 
@@ -400,8 +429,8 @@ def _reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Read
 
 @contextmanager
 def _following(
-    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, confirmations: int, confirm: bool,
-    file: Path | None, choice: Choice, address: Address | None, turns: Sequence[Callable[[], object]],
+    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, archive: str | None, confirmations: int,
+    confirm: bool, file: Path | None, choice: Choice, address: Address | None, turns: Sequence[Callable[[], object]],
 ) -> Iterator[tuple[Iterator[tuple[str, ProvenRecord]], dict[str, dict[str, Any]]]]:  # fmt: skip
     """Records as they are proven, until SIGINT or SIGTERM; and where the verdicts are when that has ended.
 
@@ -411,7 +440,7 @@ def _following(
     from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with _asking(place, nodes, confirmations, file) as asked, ExitStack() as stack:
+    with _asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
         followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
         following = Following(followed, asked.ledgers)
         view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)
