@@ -125,8 +125,9 @@ class Bucket(Archive):
         try:
             yield
         except (OSError, self._obstore.exceptions.BaseError) as error:  # its text goes on for pages
-            text = one_line(str(error).partition("\n")[0])[:300]
-            raise StoreError(f"{self} cannot be used: {text}") from None
+            text = one_line(str(error).partition("\n")[0])[:250]
+            mend = "see that it is up, and that endpoint, region and keys in [archive] are right"
+            raise StoreError(f"{self} cannot be used: {text}; {mend}") from None
 
     def put(self, digest: bytes, body: bytes) -> None:
         with self._using():

@@ -3,8 +3,11 @@ archive and chain, and comes back byte for byte, though the store is killed on t
 
 from __future__ import annotations
 
+import json
 import re
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -105,7 +108,8 @@ def test_images_and_clouds_come_back_byte_for_byte_though_the_store_is_killed(
     faults.until("a body is in the store", lambda: len(s3.files()) > 2)
     s3.kill()
     faults.until("the robot hears of it", lambda: "archive is away" in robot.said)
-    assert "cannot be used" in site.server.said and well(site) == 1  # type: ignore[union-attr]
+    faults.until("the server says so", lambda: well(site) == 1)
+    assert "cannot be used" in site.server.said  # type: ignore[union-attr]
     time.sleep(1)
     s3.start()
     assert robot.wait(120) == 0, robot.said[-3000:]
@@ -166,7 +170,12 @@ def read_all(site: faults.Site, name: str, archive: Archive) -> list[ProvenRecor
 
 def well(site: faults.Site) -> int:
     """How many of the two workers say that the archive is well."""
-    return sum(site.figure("condition", name=f"worker-{n} archives bodies") for n in range(2))
+    try:
+        answer = urllib.request.urlopen(f"http://127.0.0.1:{site.monitor_port}/readyz", timeout=5)
+    except urllib.error.HTTPError as not_ready:
+        answer = not_ready  # type: ignore[assignment]
+    conditions = json.load(answer)["conditions"]
+    return sum(conditions[f"worker-{n} archives bodies"] for n in range(2))
 
 
 def test_doctor_tries_the_archive_at_both_ends(site: faults.Site, s3: S3) -> None:
@@ -175,10 +184,12 @@ def test_doctor_tries_the_archive_at_both_ends(site: faults.Site, s3: S3) -> Non
         assert program.wait() == ends, program.said
         return program.said
 
+    faults.until("the archive is well", lambda: well(site) == 2)
     assert "s3://robots/fleet/a was written, read and cleared again" in doctor(site.home.path, 0)
     assert not [file for file in s3.files() if sm3.digest(PROBE).hex() in file.name]
     assert "s3://robots/fleet/a answers" in doctor(site.reader.path, 0)
     s3.kill()
     for home in (site.home.path, site.reader.path):
-        assert "BROKEN: archive: the archive s3://robots/fleet/a cannot be used" in doctor(home, 1)
+        said = doctor(home, 1)
+        assert "BROKEN: archive: the archive s3://robots/fleet/a cannot be used" in said and "see that it is up" in said
     s3.start()

@@ -84,6 +84,7 @@ def test_the_conditions_that_rules_ask_for_are_said_by_the_program():
     for condition in re.findall(r'condition\{name="([^"]+)"\}', RULES):
         assert f'CONDITION.labels("{condition}")' in source
     assert 'CONDITION.labels(f"{process} stores chunks")' in source
+    assert 'CONDITION.labels(f"{process} archives bodies")' in source
 
 
 def test_the_page_names_every_exit_code():
