@@ -10,7 +10,6 @@ import subprocess
 import time
 from pathlib import Path
 
-from conftest import unavailable
 from rosbridge_eth.config.models import ArchiveConfig
 
 BUCKET, SECRET = "robots", "S3RVER"  # its only account, id and secret alike
@@ -22,6 +21,8 @@ class S3:
     def __init__(self, folder: Path) -> None:
         self.program = os.environ.get("S3RVER") or shutil.which("s3rver")
         if self.program is None:
+            from conftest import unavailable  # benchmarks/video.py, which comes by here, has another one
+
             unavailable("no S3 server: npm install s3rver, and S3RVER names node_modules/.bin/s3rver")
         self.folder, self.process = folder, None
         with socket.socket() as probe:
