@@ -119,8 +119,6 @@ def init_home(
     named = parse_config(ServerConfig, text, home.config).archive
     if home.path.resolve() == reader.path.resolve():
         raise ConfigError(f"{home.path} cannot be the reader's home as well; choose another folder for one of them")
-    if named is not None and isinstance(named.url, Path):
-        named.url.mkdir(parents=True, exist_ok=True)
     with new_home(home.path), new_home(reader.path):
         for folder in (home.bundles, home.readers):
             folder.mkdir(mode=0o700)
@@ -136,6 +134,8 @@ def init_home(
         write_atomically(home.config, text.encode())
         elsewhere = {} if ca is None else {"ca": str(ca.absolute())}
         make_home(home.path, HomeKind.OPERATOR, **elsewhere, reader=str(reader.path.absolute()))
+    if named is not None and isinstance(named.url, Path):
+        named.url.mkdir(parents=True, exist_ok=True)
     return keys
 
 

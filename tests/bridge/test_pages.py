@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from bridge.archive.test_images import bag_of_images
+from bridge.archive.bags import bag_of_images
 from bridge.pages import ROOT, type_page
 from bridge.sources.ros2.graph import free_domain, ros2_python
 from conftest import unavailable

@@ -526,3 +526,19 @@ def test_a_treasury_that_is_empty_registers_and_says_that_there_is_no_eth_yet(
     monkeypatch.setattr(world.ledger, "alloc_eth", broke)
     made = world.register()
     assert not made.funded and made.bundle.exists()
+
+
+def test_an_archive_that_is_named_is_made_and_told_to_readers(tmp_path: Path):
+    home, reader = OperatorHome(tmp_path / "operator"), ReaderHome(tmp_path / "owner")
+    keys = admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=PASSPHRASE, now=NOW,
+                           listen="127.0.0.1:7410", archive=str(tmp_path / "bodies"))  # fmt: skip
+    assert (tmp_path / "bodies").is_dir() and keys is not None
+    named = load_server_config(home.config).archive
+    assert named is not None and named.url == tmp_path / "bodies"
+    home.reader_config.write_text('contract = "0x1"\n')
+    home.config.write_text(home.config.read_text() + 'endpoint = "https://s3.example.org"\nkeys = "of the server"\n')
+    later = ReaderHome(tmp_path / "later")
+    admin.add_reader(home, "later", later, ca=load_ca(home.ca, PASSPHRASE, NOW), passphrase=PASSPHRASE, now=NOW)
+    assert later.config.read_text() == (
+        f'contract = "0x1"\n\n[archive]\nurl = "{tmp_path / "bodies"}"\nendpoint = "https://s3.example.org"\n'
+    )
