@@ -38,6 +38,9 @@ def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, requi
     with Terminal(tmp_path, *commands[0], "--listen", door) as up:
         up.answer("A passphrase for all of it: ", "open sesame")
         up.answer("(again): ", "open sesame")
+        up.until("The contract is 0x")
+        contract = json.loads((tmp_path / "operator/deployment.json").read_text())["contract"].lower()
+        assert contract in (tmp_path / "operator/chain.json").read_text(), "a kill now would lose the contract for good"
         up.until("Listening on UDP")
         with Terminal(tmp_path, *commands[1]) as join:
             join.answer("Name of this robot", "")

@@ -20,6 +20,8 @@ from rosbridge_eth.errors import BridgeError, ExitCode
 from rosbridge_eth.terminal import talk
 from smcrypto import __version__
 
+INTERRUPTED = 130  # as shells say it of Ctrl-C; typer, too
+
 app = typer.Typer(
     name="rosbridge-eth",
     help="From the name of a ROS topic to a verified record on an Ethereum chain.\n\n"
@@ -54,6 +56,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         talk(f"rosbridge-eth: {error}")
         return int(error.exit_code)
     except SystemExit as stop:  # how typer ends: 0, or 2 for a usage error it has explained
+        if stop.code == INTERRUPTED:
+            talk("rosbridge-eth: interrupted")
         return stop.code if isinstance(stop.code, int) else int(ExitCode.OK)
     except BrokenPipeError:  # `read | head`: whoever took the data has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -67,5 +71,5 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return int(ExitCode.STORE)
     except KeyboardInterrupt:
         talk("rosbridge-eth: interrupted")
-        return 130
+        return INTERRUPTED
     return int(ExitCode.OK)

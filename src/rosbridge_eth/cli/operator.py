@@ -156,6 +156,8 @@ def up(
                 ) from error
         if not deployed:
             made = deploy_contract(place, url, keys)
+            if anvil is not None:
+                anvil.save()  # a kill costs some seconds of the chain, and without its contract it could not go on
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
         where = "" if home == OPERATOR_HOME else f" --home {home}"
         talk("On a robot:    rosbridge-eth join")

@@ -313,7 +313,8 @@ def test_follow_looks_again_until_it_is_interrupted(place: Place, monkeypatch: P
 
     monkeypatch.setattr(module.time, "sleep", sleep)
     assert run(["status", "--follow"]) == 130
-    assert len(looks) == 3 and "robot_1" in capsys.readouterr().out
+    shown = capsys.readouterr()
+    assert len(looks) == 3 and "robot_1" in shown.out and "rosbridge-eth: interrupted" in shown.err
 
 
 @pytest.mark.parametrize("seconds, says", [
