@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
@@ -32,9 +33,10 @@ HEADER: Final = (
     "*baseFeePerGas", "withdrawalsRoot", "*blobGasUsed", "*excessBlobGas", "parentBeaconBlockRoot", "requestsHash",
 )  # fmt: skip
 _BEFORE_LONDON: Final = 15
-#: Bytes of a node, 17 hashes and their RLP. What is larger is a leaf, and nobody has us read that again and again.
+#: Bytes of a node, 17 hashes and their RLP. What is larger is a leaf.
 _LARGEST_BRANCH: Final = 3 + 17 * 33
 _ROBOTS, _BATCH = 2, 4  # slots of RobotLedger.sol
+_OTHERWISE = "an event of the contract is not as Solidity writes it"
 _DATA = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
 _REGISTERED = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
 _REVOKED = keccak(text="Revoked(bytes32,address,uint256,uint256)")
@@ -47,16 +49,29 @@ class RlpList(bytes):
     """A list within a list, as it is encoded: `items` takes it apart."""
 
 
-def items(encoded: bytes) -> list[bytes]:
-    """The items of one RLP list: strings, and lists as RlpList."""
+def items(encoded: bytes, most: int = 1 << 20) -> list[bytes]:
+    """The items of one RLP list, of so many at most: strings, and lists as RlpList."""
+    found = list(islice(_items(encoded), most + 1))
+    if len(found) > most:
+        raise VerificationError(f"an RLP list has more than {most} items")
+    return found
+
+
+def _items(encoded: bytes) -> Iterator[bytes]:
     is_list, at, end = _extent(encoded, 0)
-    found: list[bytes] = []
     while is_list and at < end:
         inner_list, start, stop = _extent(encoded, at)
-        found.append(RlpList(encoded[at:stop]) if inner_list else encoded[start:stop])
+        yield RlpList(encoded[at:stop]) if inner_list else encoded[start:stop]
         at = stop
     if not is_list or at != end or end != len(encoded):
         raise VerificationError("what should be an RLP list is none")
+
+
+def _parts(encoded: bytes, form: str) -> list[bytes]:
+    """The items of an RLP list of this form: s is a string, l a list."""
+    found = items(encoded, len(form))
+    if "".join("sl"[isinstance(one, RlpList)] for one in found) != form:
+        raise VerificationError("an RLP list does not hold what it should")
     return found
 
 
@@ -97,38 +112,51 @@ def _number(value: bytes) -> int:
 
 
 class Nodes(dict[bytes, bytes]):
-    """Nodes of any tries, by their keccak256. used: those that a proof went through."""
+    """Nodes of any tries, by their keccak256. used: those that a proof went through.
+
+    A proof takes as many steps as its key has nibbles, through nodes of a branch's size and a leaf. No leaf is read
+    twice: of what is proven of one robot no two are the same.
+    """
 
     def __init__(self, nodes: Iterable[bytes] = ()) -> None:
         super().__init__((keccak(node), node) for node in nodes)
-        self.used: dict[bytes, bytes] = {}
+        self.used, self._leaves = dict[bytes, bytes](), set[bytes]()
 
     def value(self, root: bytes, key: bytes, what: str) -> bytes:
         """What the trie with this root has there. VerificationError where it has nothing, or a node is missing."""
-        path, node = key.hex(), self._node(root, what)
+        absent = VerificationError(f"the trie does not have {what}")
+        path, digest, node = key.hex(), root, self._node(root, what)
         while True:
-            parts = items(node)
+            parts = items(node, 17)
             if len(parts) == 17 and path:
-                child, path = parts[int(path[0], 16)], path[1:]
+                is_leaf, shared, child = False, path[0], parts[int(path[0], 16)]
             elif len(parts) == 2 and parts[0] and not isinstance(parts[0], RlpList):
                 flag, rest = divmod(parts[0][0], 16)
-                shared = (f"{rest:x}" if flag & 1 else "") + parts[0][1:].hex()
-                if flag > 3 or not path.startswith(shared):
-                    raise VerificationError(f"the trie does not have {what}")
-                child, path = parts[1], path[len(shared) :]
-                if flag & 2 and not path:
-                    return child
-                if flag & 2:
-                    raise VerificationError(f"the trie does not have {what}")
+                is_leaf, shared, child = bool(flag & 2), f"{rest:x}" * (flag & 1) + parts[0][1:].hex(), parts[1]
+                if flag > 3 or (rest and not flag & 1):
+                    raise absent
             else:
-                raise VerificationError(f"the trie does not have {what}")
-            node = child if isinstance(child, RlpList) else self._node(child, what)
+                raise absent
+            if not path.startswith(shared):
+                raise absent
+            path = path[len(shared) :]
+            if is_leaf:
+                if path or isinstance(child, RlpList):
+                    raise absent
+                if digest in self._leaves:
+                    raise VerificationError(f"the proof of {what} has the leaf of another")
+                self._leaves |= {digest} - {b""}
+                return child
+            if not shared or len(node) > _LARGEST_BRANCH:
+                raise absent
+            if isinstance(child, RlpList) and len(child) < 32:
+                digest, node = b"", child
+            else:
+                digest, node = child, self._node(child, what)
 
     def _node(self, digest: bytes, what: str) -> bytes:
         if digest not in self:
             raise VerificationError(f"the proof of {what} does not hold: a node of its trie is missing")
-        if digest in self.used and len(self[digest]) > _LARGEST_BRANCH:
-            raise VerificationError(f"the proof of {what} has the leaf of another")
         self.used[digest] = self[digest]
         return self[digest]
 
@@ -148,7 +176,7 @@ class Header(NamedTuple):
 
     @staticmethod
     def parse(encoded: bytes) -> Header:
-        fields = items(encoded)
+        fields = items(encoded, len(HEADER))
         if not _BEFORE_LONDON <= len(fields) <= len(HEADER) or any(isinstance(one, RlpList) for one in fields):
             raise VerificationError("a block's header is not in the form of one")
         number, time = _number(fields[8]), _number(fields[11])
@@ -164,27 +192,36 @@ def receipt_of(nodes: Nodes, header: Header, index: int) -> bytes:
 
 def events_of(receipt: bytes, contract: bytes, tk: bytes, block: int) -> Iterator[DataEvent | RegistrationEvent]:
     """The robot's events in a receipt, in their order."""
-    fields = items(receipt[1:] if receipt[:1] < b"\x80" else receipt)
-    for log in items(fields[3]) if len(fields) == 4 else ():
-        parts = items(log)
-        topics = items(parts[1]) if len(parts) == 3 else []
-        if len(topics) < 3 or parts[0] != contract or topics[1] != tk:
+    *_, logs = _parts(receipt[1:] if receipt[:1] < b"\x80" else receipt, "sssl")
+    for log in _items(logs):
+        address, topics, data = _parts(log if isinstance(log, RlpList) else b"", "sls")
+        named = items(topics, 4) if address == contract else []
+        if any(len(topic) != 32 or isinstance(topic, RlpList) for topic in named):
+            raise VerificationError("an event has a topic that is none")
+        if named[1:2] != [tk] or named[0] not in (_DATA, _REGISTERED, _REVOKED):
             continue
-        kind, data, account = topics[0], parts[2], "0x" + topics[-1][-20:].hex()
-        if kind == _DATA and len(topics) == 4:
-            chunks = tuple(_blobs(data, 64)) if _word(data, 32) == 64 else ()
-            yield DataEvent(_number(topics[2]), _word(data, 0), chunks, block, b"", account)
-        elif kind == _REGISTERED and _word(data, 64) == 96:
-            yield RegistrationEvent(account, _blob(data, 96), _word(data, 0), _word(data, 32), block, False)
-        elif kind == _REVOKED:
-            yield RegistrationEvent(account, b"", _word(data, 0), _word(data, 32), block, True)
+        kind, account = named[0], "0x" + named[-1][-20:].hex()
+        offset = {_DATA: (32, 64), _REGISTERED: (64, 96)}.get(kind)
+        if len(named) != 3 + (kind == _DATA) or (offset and _word(data, offset[0]) != offset[1]):
+            raise VerificationError(_OTHERWISE)
+        if kind == _DATA:
+            yield DataEvent(_small(named[2]), _word(data, 0), tuple(_blobs(data, 64)), block, b"", account)
+        else:
+            certificates = _blob(data, 96) if kind == _REGISTERED else b""
+            yield RegistrationEvent(account, certificates, _word(data, 0), _word(data, 32), block, kind == _REVOKED)
+
+
+def _small(value: bytes) -> int:
+    if (number := _number(value)) >= 1 << 53:
+        raise VerificationError("a number in an event is beyond all bounds")
+    return number
 
 
 def _word(data: bytes, at: int) -> int:
     word = data[at : at + 32]
     if len(word) != 32:
         raise VerificationError("an event of the contract ends early")
-    return _number(word)
+    return _small(word)
 
 
 def _blob(data: bytes, at: int) -> bytes:
@@ -200,7 +237,7 @@ def _blobs(data: bytes, at: int) -> Iterator[bytes]:
     place = 32 * count
     for number in range(count):
         if _word(data, begin + 32 * number) != place:
-            raise VerificationError("an event of the contract is not as Solidity writes it")
+            raise VerificationError(_OTHERWISE)
         blob = _blob(data, begin + place)
         yield blob
         place += 32 + -(-len(blob) // 32) * 32
@@ -228,10 +265,10 @@ class State:
 
     def __init__(self, nodes: Nodes, header: Header, contract: bytes) -> None:
         self._nodes = nodes
-        account = items(nodes.value(header.state_root, keccak(contract), f"the contract in block {header.number}"))
-        if len(account) != 4 or account[3] != code_hash():
+        account = nodes.value(header.state_root, keccak(contract), f"the contract in block {header.number}")
+        _, _, self._root, code = _parts(account, "ssss")
+        if code != code_hash():
             raise VerificationError("what is at the contract's address is not RobotLedger of this edition")
-        self._root = account[2]
 
     def __getitem__(self, slot: int) -> int:
         key = keccak(slot.to_bytes(32, "big"))

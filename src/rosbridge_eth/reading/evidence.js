@@ -325,21 +325,24 @@ const evidence = (() => {
     need(start + size <= data.length, 'an RLP item ends early')
     return [first >= 0xc0, start, start + size]
   }
-  function items(data) {
+  function items(data, most = Infinity) {
     let [isList, at, end] = extent(data, 0)
     need(isList && end === data.length, 'what should be an RLP list is none')
     const found = []
     while (at < end) {
       const [list, start, stop] = extent(data, at)
+      need(found.length < most, 'an RLP list has too many items')
       found.push(list ? { list: data.subarray(at, stop) } : data.subarray(start, stop))
       at = stop
     }
     need(at === end, 'what should be an RLP list is none')
     return found
   }
-  const string = (item, what) => {
-    need(item instanceof Uint8Array, `${what} is not in the form of one`)
-    return item
+  // The items of a list of this form: s is a string, l a list.
+  const partsOf = (data, form, what) => {
+    const found = items(data ?? [], form.length)
+    need(found.map((one) => (one.list ? 'l' : 's')).join('') === form, `${what} is not in the form of one`)
+    return found.map((one) => one.list ?? one)
   }
   const rlpIndex = (n) => {
     const bytes = n ? word(n, Math.ceil(n.toString(16).length / 2)) : new Uint8Array(0)
@@ -350,43 +353,44 @@ const evidence = (() => {
     constructor(list) {
       this.byHash = new Map(list.map((node) => [hex(keccak(node)), node]))
       this.used = new Set()
+      this.leaves = new Set()
       need(this.byHash.size === list.length, 'a node of a trie is there twice')
     }
 
+    // As many steps as the key has nibbles, through nodes of a branch's size; and no leaf twice.
     get(root, key, what) {
       const missing = `the trie does not have ${what}`
       let path = hex(key)
-      let node = this.at(root, what)
+      let [name, node] = this.at(root, what)
       for (;;) {
-        const parts = items(node)
-        let child
-        if (parts.length === 17 && path) {
-          child = parts[parseInt(path[0], 16)]
-          path = path.slice(1)
-        } else {
-          need(parts.length === 2 && parts[0] instanceof Uint8Array && parts[0].length, missing)
+        const parts = items(node, 17)
+        let [leaf, shared, child] = [false, path[0]]
+        if (parts.length === 17 && path) child = parts[parseInt(shared, 16)]
+        else {
+          need(parts.length === 2 && parts[0].length, missing)
           const prefix = hex(parts[0])
           const flag = parseInt(prefix[0], 16)
-          const shared = prefix.slice(flag & 1 ? 1 : 2)
-          need(flag <= 3 && path.startsWith(shared), missing)
-          path = path.slice(shared.length)
-          child = parts[1]
-          if (flag & 2) {
-            need(!path, missing)
-            return string(child, what)
-          }
+          need(flag <= 3 && (flag & 1 || prefix[1] === '0'), missing)
+          ;[leaf, shared, child] = [flag & 2, prefix.slice(flag & 1 ? 1 : 2), parts[1]]
         }
-        node = child.list ?? this.at(child, what)
+        need(path.startsWith(shared), missing)
+        path = path.slice(shared.length)
+        if (leaf) {
+          need(!path && !child.list, missing)
+          need(!this.leaves.has(name), `the proof of ${what} has the leaf of another`)
+          if (name) this.leaves.add(name)
+          return child
+        }
+        need(shared && node.length <= 3 + 17 * 33, missing)
+        ;[name, node] = child.list?.length < 32 ? ['', child.list] : this.at(child.list ?? child, what)
       }
     }
 
     at(hash, what) {
       const name = hex(hash)
       need(this.byHash.has(name), `the proof of ${what} does not hold: a node of its trie is missing`)
-      const node = this.byHash.get(name)
-      need(node.length <= 3 + 17 * 33 || !this.used.has(name), `the proof of ${what} has the leaf of another`)
       this.used.add(name)
-      return node
+      return [name, this.byHash.get(name)]
     }
   }
 
@@ -399,12 +403,14 @@ const evidence = (() => {
   const REVOKED = topic('Revoked(bytes32,address,uint256,uint256)')
 
   function* eventsOf(receipt, contract, tk, block) {
-    const fields = items(receipt[0] < 0x80 ? receipt.subarray(1) : receipt)
-    need(fields.length === 4 && fields[3].list, 'a receipt is not in the form of one')
-    for (const log of items(fields[3].list)) {
-      const [address, topics, data] = items(log.list ?? string(null, 'a log'))
-      const [kind, robot, ...more] = items(topics.list ?? string(null, 'a log')).map((one) => string(one, 'a topic'))
-      if (!kind || !same(address, contract) || !robot || !same(robot, tk)) continue
+    const [, , , logs] = partsOf(receipt[0] < 0x80 ? receipt.subarray(1) : receipt, 'sssl', 'a receipt')
+    for (const log of items(logs)) {
+      const [address, topics, data] = partsOf(log.list, 'sls', 'a log')
+      if (!same(address, contract)) continue
+      const named = items(topics, 4)
+      need(named.every((one) => one.length === 32), 'an event has a topic that is none')
+      const [kind, robot, first] = named.map(hex)
+      if (robot !== hex(tk) || ![DATA, REGISTERED, REVOKED].includes(kind)) continue
       const number = (at) => {
         need(at + 32 <= data.length, 'an event ends early')
         return small(data.subarray(at, at + 32), 'a number in an event')
@@ -414,18 +420,24 @@ const evidence = (() => {
         need(end <= data.length, 'an event ends early')
         return data.subarray(at + 32, end)
       }
-      if (hex(kind) === DATA) {
+      const asWritten = (holds) => need(holds, 'an event of the contract is not as Solidity writes it')
+      asWritten(named.length === (kind === DATA ? 4 : 3))
+      const [zeroth, previous] = [number(0), number(32)]
+      if (kind === DATA) {
+        asWritten(previous === 64)
         const [count, chunks] = [number(64), []]
         let place = 32 * count
         for (let n = 0; n < count; n++) {
-          need(number(96 + 32 * n) === place, 'an event is not as Solidity writes it')
+          asWritten(number(96 + 32 * n) === place)
           chunks.push(blob(96 + place))
           place += 32 + Math.ceil(chunks[n].length / 32) * 32
         }
-        yield { data: true, first: small(more[0], 'the number of a chunk'), chunks, block }
-      } else if (hex(kind) === REGISTERED) {
-        yield { index: number(0), previous: number(32), certificates: blob(96), block }
-      } else if (hex(kind) === REVOKED) yield { index: number(0), previous: number(32), revoked: true, block }
+        yield { data: true, first: small(unhex(first), 'the number of a chunk'), chunks, block }
+      } else if (kind === REVOKED) yield { index: zeroth, previous, revoked: true, block }
+      else {
+        asWritten(number(64) === 96)
+        yield { index: zeroth, previous, certificates: blob(96), block }
+      }
     }
   }
 
@@ -434,16 +446,19 @@ const evidence = (() => {
   function chunkOf(data) {
     const count = data[138]
     const end = 139 + count * 121
-    need(data.length >= end + 64 && data[0] === 2 && data[1] <= 3 && count <= 16, 'a chunk is not in the form of one')
+    const form = (holds) => need(holds, 'a chunk is not in the form of one')
+    form(data.length >= end + 64 && data[0] === 2 && data[1] <= 3 && count >= 1 && count <= 16)
     const header = data.subarray(0, end)
     const field = (at, size) => header.subarray(at, at + size)
     const rest = data.length - end - 64
     const length = small(field(102, 4))
-    need(rest === 0 || rest === length, 'a chunk is not in the form of one')
+    form(length % 64 === 16 && length > 16 && length < (data[1] & 2 ? 2 ** 24 : 2 ** 16) && (rest === 0 || rest === length))
+    form(small(field(66, 4)) >= 1 && small(field(66, 4)) <= 1000 && big(field(58, 8)) < 253402300800000n)
     return {
       encoded: header, digest: hex(sm3(header)), stream: hex(field(2, 16)), number: String(big(field(18, 8))),
       sealed: small(field(58, 8), 'when a chunk was sealed'), records: small(field(66, 4)), root: field(70, 32),
-      r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0 && length > 0,
+      r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0,
+      longest: data[1] & 2 ? 2 ** 24 - 2 ** 17 : 60 * 1024, // bytes of a line
     }
   }
 
@@ -463,11 +478,29 @@ const evidence = (() => {
     return sn === 0 && same(r, root)
   }
 
-  // A record's line, its long integers as text: JavaScript's numbers would lose digits of the times.
-  function parsed(line) {
-    const exact = line.replace(/"[^"\\]*(?:\\.[^"\\]*)*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?/g, (token) =>
-      token.length > 15 && /^-?\d+$/.test(token) ? `"${token}"` : token)
-    const value = JSON.parse(exact)
+  // A record's line, its long integers as text: JavaScript's numbers would lose digits of the times. As the robot writes
+  // it: no white space, no needless escapes, no name twice; JSON.parse takes the last of two, and 1e400 for a number.
+  const STRING = String.raw`"[^"\\]*(?:\\.[^"\\]*)*"`
+  const TOKEN = new RegExp(`${STRING}|[-+.\\w]+|[^]`, 'g')
+  const MESSAGE = new RegExp(`^\\{"topic":${STRING},"type":${STRING},"source":${STRING},` +
+    '"received_ns":(\\d+),"captured_ns":(\\d+),"clock":(?:true|false),"data":\\{')
+  function parsed(line, most) {
+    const form = (holds) => need(holds, 'it is not in the one form of a record')
+    form(utf8.encode(line).length <= most)
+    const [message, ...times] = MESSAGE.exec(line) ?? []
+    need(message && times.every((time) => BigInt(time) < 2n ** 63n), 'it is no captured message')
+    const [tokens, open] = [line.match(TOKEN), []] // open: of each level, an object's names, or null for an array
+    const exact = tokens.map((token, n) => {
+      if (token === '{' || token === '[') form(open.push(token === '{' ? new Set() : null) <= 100)
+      else if (token === '}' || token === ']') open.pop()
+      else if (token[0] === '"') {
+        const text = JSON.parse(token)
+        form(JSON.stringify(text) === token && !/\p{Cs}/u.test(text))
+        if (tokens[n + 1] === ':') form(open.at(-1) && !open.at(-1).has(text) && open.at(-1).add(text))
+      } else form(token.trim() && (!/[-\d]/.test(token[0]) || Number.isFinite(Number(token))))
+      return token.length > 15 && /^-?\d+$/.test(token) ? `"${token}"` : token
+    })
+    const value = JSON.parse(exact.join(''))
     need(Object.keys(value).join() === 'topic,type,source,received_ns,captured_ns,clock,data', 'it is no captured message')
     return value
   }
@@ -504,7 +537,7 @@ const evidence = (() => {
     for (const record of list(file.records, 'the records')) {
       members(record, 'chunk,record,line,salt,path', 'a record')
       need(isCount(record.chunk) && isCount(record.record) && record.record < 1000, 'a record has no place')
-      need(typeof record.line === 'string', 'a record has no line')
+      need(typeof record.line === 'string' && !/\p{Cs}/u.test(record.line), 'a record has no line, or half a character in it')
     }
     need(file.records.length > 0 && file.blocks.length > 0, 'there is nothing in the file')
     return file
@@ -524,9 +557,9 @@ const evidence = (() => {
     const events = []
     const blocks = file.blocks.map((block) => {
       const encoded = unhex(block.header, undefined, 'a header')
-      const fields = items(encoded)
-      need(fields.length >= 15 && fields.length <= 21, "a block's header is not in the form of one")
-      const [state, receipts, number, time] = [3, 5, 8, 11].map((n) => string(fields[n], "a block's header"))
+      const fields = items(encoded, 21)
+      need(fields.length >= 15 && fields.every((one) => !one.list), "a block's header is not in the form of one")
+      const [state, receipts, number, time] = [3, 5, 8, 11].map((n) => fields[n])
       need(same(unhex(block.hash, 32, "a block's hash"), keccak(encoded)), "a block's header does not have its hash")
       const [at, when] = [small(number, "a block's number"), small(time, "a block's time")]
       return { number: at, time: when, state, receipts, hash: block.hash, shows: block.receipts }
@@ -546,9 +579,8 @@ const evidence = (() => {
     told(`the contract's events are in these blocks, by the receipts under their receiptsRoot`)
 
     // the contract's storage
-    const account = items(nodes.get(last.state, keccak(contract), `the contract in block ${last.number}`))
-    need(account.length === 4 && hex(string(account[3], 'an account')) === CODE,
-      "what is at the contract's address is not RobotLedger of this edition")
+    const account = partsOf(nodes.get(last.state, keccak(contract), `the contract in block ${last.number}`), 'ssss', 'an account')
+    need(hex(account[3]) === CODE, "what is at the contract's address is not RobotLedger of this edition")
     const slot = (key) => {
       const value = nodes.get(account[2], keccak(key), "a slot of the contract's storage")
       const [isList, start, end] = extent(value, 0)
@@ -611,7 +643,7 @@ const evidence = (() => {
         const beside = list(path, 'the hashes of a path').map((one) => unhex(one, 32, 'a hash'))
         const holds = proven(of.root, of.records, record, unhex(salt, 16, 'a salt'), utf8.encode(line), beside)
         need(holds, "it is not what the chunk's root commits to")
-        return { chunk, record, line, content: parsed(line), sealed: of.sealed, of, block: of.block }
+        return { chunk, record, line, content: parsed(line, of.longest), sealed: of.sealed, of, block: of.block }
       } catch (error) {
         throw new Wrong(`record ${record} of chunk ${chunk}: ${error.message}`)
       }

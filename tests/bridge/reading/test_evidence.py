@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -15,17 +16,19 @@ import rlp
 from eth_utils.crypto import keccak
 from hypothesis import given
 from hypothesis import strategies as st
+from trie.hexary import HexaryTrie
 
 import geth_network
 from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, odometry, record
 from bridge.reading.world import NAME, START, Pen, authority, message, reader, robot
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth.chunk import Chunk, content_key
+from rosbridge_eth.chunk import Chunk, content_key, prove
 from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
 from rosbridge_eth.ledger import Ledger, proofs
+from rosbridge_eth.ledger.contract import DataEvent
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
 from rosbridge_eth.reading import Choice
 from rosbridge_eth.reading.evidence import MAX_FILE, Evidence, Statement, ask, verify
@@ -481,6 +484,131 @@ def test_a_large_leaf_is_read_once(one: str, javascript):
     with pytest.raises(VerificationError, match="leaf of another"):
         check(text)
     assert "leaf of another" in javascript([text])[0]
+
+
+def invented(receipt: Callable[[list[Any]], Any] = list, state: Callable[[bytes], bytes] = bytes) -> str:
+    """The vector on blocks of one's own: every receipt as `receipt` makes it, `state` above the state's root, and all
+    tries, headers and hashes made anew. Who has no key of the robot can go so far.
+    """
+    e = Evidence.read((VECTORS / "span.json").read_bytes())
+    old, last, tk = proofs.Nodes(e.nodes), proofs.Header.parse(e.blocks[-1].header), keccak(NAME.encode())
+    storage, slots = proofs.State(old, last, e.contract), proofs.robot_slots(tk)
+    tries, blocks = dict[bytes, bytes](), []
+
+    def trie(values: dict[bytes, bytes]) -> tuple[bytes, dict[bytes, bytes]]:
+        made = HexaryTrie({}, prune=True)
+        for key, value in values.items():
+            made[key] = value
+        return made.root_hash, made.db
+
+    for block in e.blocks:
+        header, *fields = proofs.Header.parse(block.header), *map(bytes, proofs.items(block.header))
+        receipts = {index: proofs.receipt_of(old, header, index) for index in block.receipts}
+        for value in receipts.values():
+            events = proofs.events_of(value, e.contract, tk, header.number)
+            slots += [proofs.batch_slot(tk, one.first) for one in events if isinstance(one, DataEvent)]
+        changed = {rlp.encode(n): one[:1] + rlp.encode(receipt(rlp.decode(one[1:]))) for n, one in receipts.items()}
+        fields[5], made = trie(changed)
+        tries |= made
+        if header == last:
+            words = {keccak(slot.to_bytes(32)): rlp.encode(storage[slot]) for slot in set(slots)}
+            (root, made), code = trie(words), proofs.code_hash()
+            account = keccak(rlp.encode([b"\x20" + keccak(e.contract), rlp.encode([b"", b"", root, code])]))
+            tries |= made | {account: rlp.encode([b"\x20" + keccak(e.contract), rlp.encode([b"", b"", root, code])])}
+            above = state(account)
+            fields[3] = keccak(above) if above != account else account
+            tries |= {keccak(above): above} if above != account else {}
+        encoded = rlp.encode(fields)
+        blocks.append(block.model_copy(update={"header": encoded, "hash": keccak(encoded)}))
+    tries.pop(keccak(b"\x80"), None)
+    return e.model_copy(update={"blocks": blocks, "nodes": [*tries.values()]}).encode()
+
+
+def with_log(n: int, part: Any) -> Callable[[list[Any]], Any]:
+    """The receipt with another n-th part of its first log: address, topics, data."""
+    return lambda fields: [*fields[:3], [[*fields[3][0][:n], part(fields[3][0][n]), *fields[3][0][n + 1 :]]]]
+
+
+INVENTED = {
+    "logs as a string": lambda: invented(lambda fields: [*fields[:3], rlp.encode(fields[3])]),
+    "a topic of 33 bytes": lambda: invented(with_log(1, lambda topics: [*topics[:2], b"\1" + topics[2], *topics[3:]])),
+    "another place of the array": lambda: invented(
+        with_log(2, lambda data: data[:63] + bytes([data[63] ^ 32 * (data[32:64] == (64).to_bytes(32))]) + data[64:])
+    ),
+    "a receipt of five fields": lambda: invented(lambda fields: [*fields, b""]),
+    "an extension without nibbles": lambda: invented(state=lambda account: rlp.encode([b"\0", account])),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", INVENTED)
+def test_what_no_chain_would_write_is_refused_in_both_languages(what: str, javascript):
+    roots = read_certificates((VECTORS / "ca.crt.pem").read_bytes())
+    assert len(check(invented(), roots).records) == 5
+    with pytest.raises(VerificationError):
+        check(INVENTED[what](), roots)
+    good, bad = javascript([invented(), INVENTED[what]()])
+    assert len(good["lines"]) == 5 and isinstance(bad, str)
+
+
+def test_a_proof_takes_no_more_steps_than_its_key_has_nibbles():
+    """Else a node of megabytes that holds itself a million times, or a leaf for all keys, keeps a verifier for days."""
+    leaf = rlp.encode([b"\x20", b"value"])
+    embedded: Any = [b"\x20", b"value"]
+    for _ in range(200):
+        embedded = [b"\0", embedded]
+    branch = rlp.encode([*[keccak(leaf)] * 16, b""])
+    for nodes, keys in (
+        ([leaf, rlp.encode([b"\0", keccak(leaf)])], [b""]), ([rlp.encode(embedded)], [b""]),
+        ([rlp.encode([b"\x2f", b"value"])], [b""]), ([rlp.encode([b"\x20", [b"value"]])], [b""]),
+        ([leaf, branch, rlp.encode([b"\x16", keccak(branch)])], [b"\x61", b"\x62"]),
+        ([leaf, rlp.encode([*[keccak(leaf)] * 16, bytes(600)]), rlp.encode([b"\x16", keccak(branch)])], [b"\x61"]),
+        ([rlp.encode([b""] * 18)], [b""]),
+    ):  # fmt: skip
+        trie = proofs.Nodes(nodes)
+        with pytest.raises(VerificationError):
+            for key in keys:
+                assert trie.value(keccak(nodes[-1]), key, "what is proven") == b"value"
+    assert proofs.Nodes([leaf]).value(keccak(leaf), b"", "what is proven") == b"value"
+
+
+GOOD_LINE = odometry(1)
+LINES = {
+    "a name twice": GOOD_LINE.replace(b'"data":{', b'"data":{"pose":1,'), "half a character": message(1, text="?"),
+    "beyond a double": GOOD_LINE.replace(b'"z":0.0', b'"z":1e400'),
+    "a space": GOOD_LINE.replace(b'"z":', b'"z": '), "an escape too many": GOOD_LINE.replace(b'"z"', b'"\\u007a"'),
+    "a time as text": re.sub(rb'"received_ns":(\d+)', rb'"received_ns":"\1"', GOOD_LINE),
+    "too deep": message(1, a=0).replace(b'"a":0', b'"a":' + b"[" * 99 + b"]" * 99),
+    "no object": re.sub(rb'"data":.*', b'"data":[]}', GOOD_LINE),
+    "too long": message(1, text="x" * 61_440),
+}  # fmt: skip
+
+
+def test_lines_that_only_a_lying_robot_writes_are_refused_in_both_languages(node: Anvil, javascript):
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    LINES["half a character"] = LINES["half a character"].replace(b"?", b"\\ud800")
+    lines = [message(at(0.1), text="\ufffd"), *LINES.values()]
+    chunk = made.pen.write(*lines)
+    made.write(chunk)
+    text = made.evidence(Choice(to_ns=at(0.2))).encode()
+    assert len(both(text, javascript).records) == 1
+    key, texts = content_key(chunk.header, reader().encryption_key), [text.replace("\\ufffd", "\\ud800")]
+    for n in range(1, len(lines)):
+        proof, value = prove(lines, key, n), json.loads(text)
+        path = [each.hex() for each in proof.path]
+        value["records"][0] |= {"record": n, "line": lines[n].decode(), "salt": proof.salt.hex(), "path": path}
+        texts.append(json.dumps(value, separators=(",", ":")))
+    answers = javascript(texts)
+    for what, one_text, answer in zip(["half a character in the file", *LINES], texts, answers, strict=True):
+        with pytest.raises(VerificationError):
+            check(one_text)
+            pytest.fail(what)
+        assert isinstance(answer, str), what
+
+
+@pytest.mark.parametrize("values", [b"0," * 3_000_000, b"[]," * 2_000_000, b'"",' * 5_000_000, b'"' * 9_000_000])
+def test_values_that_would_fill_the_memory_are_counted_before_they_are_made(values: bytes):
+    with pytest.raises(VerificationError, match="more values than any could have"):
+        Evidence.read(b'{"format":"rosbridge-eth evidence 1","nodes":[' + values + b"0]}")
 
 
 # ---------------------------------------------------------------------- the node
