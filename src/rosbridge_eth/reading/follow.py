@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Final
 
-from rosbridge_eth.errors import ChainError
+from rosbridge_eth.errors import ChainError, IdentityError
 from rosbridge_eth.reading.fetch import MARGIN, Reading
 from rosbridge_eth.reading.verdict import Bookmarks, Kind, shown
 from rosbridge_eth.reading.verify import Choice, ProvenRecord
@@ -43,7 +43,12 @@ class Followed:
 
     def new(self, choice: Choice, now: float) -> Iterator[ProvenRecord]:
         """The records that were not given before. What is behind chunks that a node withholds comes after those."""
-        reading = self._read(self.name, now=now, before=self._before)
+        try:
+            reading = self._read(self.name, now=now, before=self._before)
+        except IdentityError as error:
+            if self.reading is None:
+                raise
+            raise ChainError(f"{error}, where it was before") from error  # the node is behind, or of another chain
         before, self._before = self._before, None  # it is used up, also where this one ends in the middle
         if before is None:
             self._until = inf if reading.kept is None else reading.top.number + MARGIN

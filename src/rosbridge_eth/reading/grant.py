@@ -18,7 +18,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 from pydantic import AwareDatetime, BaseModel, StringConstraints, ValidationError
 
 from rosbridge_eth.chunk import KEY_SIZE, Chunk, Malformed
-from rosbridge_eth.errors import ChainError, IdentityError, VerificationError
+from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust, public_identity, sign, verify
 from rosbridge_eth.reading.fetch import Reading
 from rosbridge_eth.reading.verdict import shown
@@ -27,6 +27,8 @@ from smcrypto import InvalidCiphertext, InvalidSignature, InvalidTag, sm4
 
 Keys: TypeAlias = dict[bytes, bytes]
 """By the digest of a chunk, its content key."""
+MAX_FILE: Final = 64 * 2**20
+"""Of half a million chunks and more."""
 _ENTRY: Final = 32 + KEY_SIZE
 _NONCE: Final = bytes(12)
 _Hex: TypeAlias = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{2})*$")]
@@ -79,7 +81,10 @@ def make(
         key=to.encryption_certificate.public_key.encrypt(key, encoding="c1c3c2").hex(), sealed=sealed.hex(),
     )  # fmt: skip
     document.signature = sign(by.signing_key, "grant", document.signed).hex()
-    return document.model_dump_json(indent=1).encode() + b"\n"
+    made = document.model_dump_json(indent=1).encode() + b"\n"
+    if len(made) > MAX_FILE:
+        raise ConfigError(f"a grant has at most {MAX_FILE >> 20} MiB, and {len(keys):,} chunks take more; grant parts")
+    return made
 
 
 def open_grant(data: bytes, *, ledger: bytes, reader: Identity, trust: Trust) -> tuple[str, Keys]:
@@ -116,6 +121,8 @@ def open_folder(folder: Path, *, ledger: bytes, reader: Identity, trust: Trust) 
     found = defaultdict[str, Keys](Keys)
     for file in sorted(folder.glob("*")):
         try:
+            if not file.is_file() or file.stat().st_size > MAX_FILE:
+                raise VerificationError(f"it is no file, or has more than {MAX_FILE >> 20} MiB")
             robot, keys = open_grant(file.read_bytes(), ledger=ledger, reader=reader, trust=trust)
             found[robot] |= keys
         except (IdentityError, VerificationError) as error:

@@ -13,6 +13,7 @@ import json
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -26,15 +27,19 @@ from rosbridge_eth.config.values import Address, time_text
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.reading.follow import EVERY, Followed
 from rosbridge_eth.reading.outputs import Trajectory, flattened
-from rosbridge_eth.reading.verdict import printable, shown
+from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.reading.verify import ProvenRecord
 
 MAX_POINTS: Final = 1 << 10
 """Of a topic's trajectory; a longer one is thinned out all over its length."""
 MAX_TOPICS: Final = 64
 MAX_FIELDS: Final = 64
+MAX_TOPIC: Final = 255
+"""Characters of its name."""
 MAX_PAGES: Final = 16
 """Pages that are shown at once."""
+MAX_CONNECTIONS: Final = 64
+"""At once; each has a thread. Further ones are closed, so that the reading keeps its memory and its files."""
 QUIET: Final = 15
 """So many seconds without news, and a comment is sent: an end that is gone is noticed."""
 PATIENCE: Final = 10.0
@@ -55,6 +60,7 @@ class View:
 
     def __init__(self, nodes: Sequence[str], confirmations: int, robots: Iterable[str]) -> None:
         self._lock, self.version, self.closed = threading.Lock(), 0, threading.Event()
+        self._made, self._due = (-1, b""), 0.0
         self._about = {"nodes": nodes, "confirmations": confirmations}
         self._tracks = {name: Trajectory(MAX_POINTS) for name in robots}
         self._latest: dict[str, dict[str, ProvenRecord | dict[str, Any]]] = {name: {} for name in self._tracks}
@@ -77,15 +83,19 @@ class View:
             self.version += 1
 
     def state(self) -> tuple[int, bytes]:
-        """The version and, as JSON, all of it."""
+        """The version and, as JSON, all of it; made once a second at most, for all pages: nobody writes meanwhile."""
         with self._lock:
+            if time.monotonic() < self._due:
+                return self._made
             robots = [
                 {"name": name, **self._stands[name], "tracks": _tracks(track),
                  "latest": [one if isinstance(one, dict) else _values(one)
                             for _, one in sorted(self._latest[name].items())]}
                 for name, track in self._tracks.items()
             ]  # fmt: skip
-            return self.version, json.dumps(self._about | {"robots": robots}, separators=(",", ":")).encode()
+            state = json.dumps(self._about | {"robots": robots}, separators=(",", ":")).encode()
+            self._made, self._due = (self.version, state), time.monotonic() + EVERY
+            return self._made
 
 
 def _standing(robot: Followed) -> dict[str, Any]:
@@ -102,7 +112,8 @@ def _standing(robot: Followed) -> dict[str, Any]:
 
 def _tracks(trajectory: Trajectory) -> list[dict[str, Any]]:
     return [
-        {"topic": printable(topic), "count": track.count, "from_ns": str(track.kept[0][0]), "to_ns": str(track.last[0]),
+        {"topic": shown(topic, MAX_TOPIC), "count": track.count,
+         "from_ns": str(track.kept[0][0]), "to_ns": str(track.last[0]),
          "points": [[float(f"{x:.7g}"), float(f"{y:.7g}")] for _, x, y in (*track.kept, track.last)]}
         for topic, track in trajectory.tracks.items()
     ]  # fmt: skip
@@ -113,8 +124,9 @@ def _values(record: ProvenRecord) -> dict[str, Any]:
     cells = flattened(content.data, "")
     fields = [[shown(name), shown(_text(value), 80)] for name, value in islice(cells, MAX_FIELDS)]
     return {
-        "topic": printable(content.topic), "type": shown(content.type_name), "received": time_text(content.received_ns),
-        "chunk": place.chunk, "block": place.block, "fields": fields, "more": sum(1 for _ in cells),
+        "topic": shown(content.topic, MAX_TOPIC), "type": shown(content.type_name),
+        "received": time_text(content.received_ns), "chunk": place.chunk, "block": place.block,
+        "fields": fields, "more": sum(1 for _ in cells),
     }  # fmt: skip
 
 
@@ -134,7 +146,8 @@ class Page:
             "files": {path: (files.joinpath(name).read_bytes(), kind) for path, (name, kind) in _FILES.items()},
         })  # fmt: skip
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
-        server = type("_Server", (_Server,), {"address_family": family})
+        room = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        server = type("_Server", (_Server,), {"address_family": family, "room": room})
         try:
             self._http = server(tuple(address), handler)
         except OSError as error:
@@ -149,7 +162,17 @@ class Page:
 
 
 class _Server(ThreadingHTTPServer):
-    daemon_threads = True
+    daemon_threads, request_queue_size = True, MAX_CONNECTIONS
+    room: threading.BoundedSemaphore
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self.room.acquire(blocking=False)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exception(), OSError):  # a page that was closed
@@ -175,6 +198,9 @@ class _Handler(BaseHTTPRequestHandler):
         # A site that gave its own name this machine's address (DNS rebinding) comes with its own name here.
         if _host(self.headers.get("Host", "")) not in self.names:
             self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")
+        elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            # Another site's page cannot read them, but could take up all the room.
+            self._send(HTTPStatus.FORBIDDEN, b"these events are for this page only\n")
         elif self.path == "/events":
             self._send_events()
         elif self.path in self.files:

@@ -160,7 +160,8 @@ def test_the_ca_that_one_has_is_compared(browser: Browser, one: Evidence, tmp_pa
     other = create_ca("Another", at=ROOTS[0].not_before).certificate
     for number, (name, pem, expected) in enumerate((
         ("bad", other.to_pem(), "ANOTHER CA"), ("good", ROOTS[0].to_pem(), "It is the CA of this"),
-        ("bad", b"nothing", "holds no certificate"),
+        ("bad", b"nothing", "holds no certificate"), ("good", ROOTS[0].to_pem() + b"\n", "It is the CA of this"),
+        ("bad", ROOTS[0].to_pem().replace(b"\nMII", b"\n!!!!!MII"), "holds no certificate"),
     )):  # fmt: skip
         (tmp_path / f"{number}.pem").write_bytes(pem)
         choose(browser, "ca", tmp_path / f"{number}.pem")

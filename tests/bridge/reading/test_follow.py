@@ -264,6 +264,19 @@ def test_a_name_that_nobody_has_ends_it(chain: Chain, tmp_path: Path):
         Follow(tmp_path, chain.ledger, names=("robot_9",)).look()
 
 
+def test_a_node_that_comes_back_without_the_robot_is_waited_for(chain: Chain, tmp_path: Path):
+    """It is synchronised anew, or another chain: the first may become right, and neither ends the following."""
+    node = Node(chain.ledger, "http://behind")
+    follow = Follow(tmp_path, node)
+    chain.write(chain.pen.chunks(2))
+    assert follow.look() == [0, 1]
+    node._standing = {"account": None}
+    chain.write(chain.pen.chunks(1))
+    assert follow.look() == [] and "where it was before" in follow.robots[0].trouble
+    node._standing = {}
+    assert follow.look() == [2] and not follow.robots[0].trouble and follow.verdict.sound
+
+
 def test_with_confirmations_the_newest_blocks_are_given_later(chain: Chain, tmp_path: Path):
     follow = Follow(tmp_path, chain.ledger, confirmations=3)
     given = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -150,6 +151,25 @@ def test_what_is_no_grant_for_this_reader_is_refused_with_a_sentence(chain: Chai
     with pytest.raises(BridgeError, match=why) as refused:
         open_folder(tmp_path, ledger=chain.ledger.ledger, reader=INSURER, trust=TRUST)
     assert str(refused.value).startswith(f"the grant {tmp_path / 'a.grant'} cannot be used: ")
+
+
+def test_what_is_no_file_or_too_large_is_named_and_not_waited_for(chain: Chain, tmp_path: Path, monkeypatch: Any):
+    def use(folder: Path) -> None:
+        open_folder(folder, ledger=chain.ledger.ledger, reader=INSURER, trust=TRUST)
+
+    for name, made in (("fifo", os.mkfifo), ("folder", os.mkdir), ("loop", lambda path: os.symlink(path, path))):
+        (tmp_path / name).mkdir()
+        made(tmp_path / name / "a.grant")
+        with pytest.raises(VerificationError, match=r"a\.grant cannot be used: it is no file"):
+            use(tmp_path / name)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "b.grant").write_bytes(grant({b"d" * 32: b"k" * 16}, chain.ledger.ledger))
+    use(tmp_path / "b")
+    monkeypatch.setattr("rosbridge_eth.reading.grant.MAX_FILE", 1_000)
+    with pytest.raises(VerificationError, match="or has more than"):
+        use(tmp_path / "b")
+    with pytest.raises(BridgeError, match="grant parts"):
+        grant({b"d" * 32: b"k" * 16}, chain.ledger.ledger)
 
 
 def test_all_grants_of_a_folder_are_used_each_for_its_robot(chain: Chain, tmp_path: Path):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +144,46 @@ def test_pages_beyond_the_bound_are_refused_and_closed_ones_make_room(watch: Wat
     while watch.ask("/events").status == 503:  # noticed when it is written to
         watch.view.show([])
         assert time.monotonic() < deadline
+
+
+def test_another_site_s_page_takes_no_room(watch: Watch):
+    """A browser says who asks; such a page could not read the events, but keep them from others."""
+    for site, status in (("cross-site", 403), ("same-site", 403), ("same-origin", 200), ("none", 200)):
+        connection = http.client.HTTPConnection(*watch.page.address, timeout=20)
+        connection.request("GET", "/events", headers={"Sec-Fetch-Site": site})
+        assert connection.getresponse().status == status, site
+        connection.close()
+
+
+def test_connections_beyond_the_bound_are_closed_and_hold_nothing_up(watch: Watch, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rosbridge_eth.reading.live.MAX_CONNECTIONS", 4)
+    page = Page(Address("127.0.0.1", 0), watch.view)
+    before = threading.active_count()
+    idle = [socket.create_connection(tuple(page.address), timeout=20) for _ in range(20)]
+    assert idle[-1].recv(1) == b"", "closed at once"
+    assert threading.active_count() <= before + 4
+    for one in idle:
+        one.close()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        with suppress(OSError, http.client.HTTPException):
+            connection = http.client.HTTPConnection(*page.address, timeout=20)
+            connection.request("GET", "/")
+            assert connection.getresponse().status == 200
+            break
+    else:
+        pytest.fail("no room again")
+    page.close()
+
+
+def test_what_is_shown_is_made_once_for_all_pages_and_names_are_bounded(watch: Watch):
+    watch.write(*(odometry(n, f"/{n}" + "x" * 20_000) for n in range(3)))
+    _, state = watch.view.state()
+    assert len(state) < 10_000 and len(json.loads(state)["robots"][0]["latest"]) == 3
+    watch.view.show([])
+    assert watch.view.state()[1] is state, "sixteen pages do not hold the reading up sixteen times"
+    [*_, robot] = json.loads(state)["robots"]
+    assert all(len(one["topic"]) == 255 for one in (*robot["latest"], *robot["tracks"]))
 
 
 def test_closing_ends_the_events(watch: Watch):
