@@ -116,8 +116,8 @@ def live(make: Callable[[], RenderableType]) -> Iterator[Callable[[], None]]:
 
 
 def print_json(value: Any) -> None:
-    """One JSON value on stdout, for programs."""
-    sys.stdout.write(json.dumps(value, ensure_ascii=False) + "\n")
+    """One JSON value on stdout, for programs. In ASCII: what a robot wrote does not act on a terminal."""
+    sys.stdout.write(json.dumps(value) + "\n")
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[int] = ()) -> Table:

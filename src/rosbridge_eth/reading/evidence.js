@@ -605,7 +605,9 @@ const evidence = (() => {
     const whole = ({ issuer, subject, key, tbs, r, s }) => issuer !== subject || signed(key, tbs, r, s)
     need(ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
     let [before, index, hash, revoked] = [0, 0, 0n, false]
-    const signers = events.filter(({ data }) => !data).map((event) => {
+    const registrations = events.filter(({ data }) => !data)
+    need(registrations.length <= 1000, 'the robot has more than 1,000 registrations and revocations')
+    const signers = registrations.map((event) => {
       need(event.previous === before && event.index >= index, 'the registrations do not follow each other')
       ;[before, index, revoked] = [event.block.number, event.index, Boolean(event.revoked)]
       if (revoked) return { first: index, block: event.block, why: 'revoked' }

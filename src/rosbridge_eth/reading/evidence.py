@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 FORMAT: Final = "rosbridge-eth evidence 1"
 MAX_FILE: Final = 64 * 2**20
 MAX_CHOSEN: Final = 100_000
+MAX_REGISTRATIONS: Final = 1_000
 _MAX_STRUCTURE: Final = 4 * 2**20
 """Characters outside of strings. Values take more memory than their text, and each that is wrong still more."""
 _BEGIN: Final = '<script type="application/json" id="evidence">'
@@ -249,6 +250,9 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
         raise VerificationError("a block's header does not have its hash")
     events = list(_events(evidence, nodes, headers, tk))
     data = [event for event in events if isinstance(event, DataEvent)]
+    registrations = [event for event in events if isinstance(event, RegistrationEvent)]
+    if len(registrations) > MAX_REGISTRATIONS:
+        raise VerificationError(f"the robot has more than {MAX_REGISTRATIONS:,} registrations and revocations")
     told("the contract's events are in these blocks, by the receipts under their receiptsRoot")
 
     last = headers[-1]
@@ -263,7 +267,7 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
 
     log, times = Log(ledger_id(e.chain_id, e.genesis, e.contract), tk), {one.number: one.time for one in headers}
     verifier = Verifier(
-        e.robot, log.ledger, standing, [event for event in events if isinstance(event, RegistrationEvent)],
+        e.robot, log.ledger, standing, registrations,
         trust=Trust(trusted), reader=None, block=last.number, block_time=times.__getitem__, now=0.0,
     )  # fmt: skip
     if not verifier.honest:

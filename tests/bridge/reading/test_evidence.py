@@ -170,6 +170,19 @@ def test_a_moment_is_the_last_record_of_each_topic(recorded: Recorded, javascrip
     assert "\u202e" not in shown and json.loads(shown)["data"] == evil.content.data
 
 
+def test_as_json_nothing_of_it_acts_on_a_terminal(recorded: Recorded, tmp_path: Path, capsys):
+    (tmp_path / "evil.json").write_text(recorded.evidence(Choice("/evil")).encode())
+    assert run(["verify", str(tmp_path / "evil.json"), "--ca", str(write_ca(tmp_path)), "--json"]) == 0
+    said = capsys.readouterr().out
+    assert said[:-1].isprintable() and said.isascii()
+    assert json.loads(json.loads(said)["records"][0]["line"])["data"]["text"] == EVIL
+
+
+def write_ca(folder: Path) -> Path:
+    (folder / "ca.pem").write_bytes(ROOTS[0].to_pem())
+    return folder / "ca.pem"
+
+
 def test_what_it_proves_and_what_not_is_said_in_words(one: str, span: str):
     found = check(one)
     said = " ".join(found.proves())
@@ -548,6 +561,15 @@ def test_what_no_chain_would_write_is_refused_in_both_languages(what: str, javas
         check(INVENTED[what](), roots)
     good, bad = javascript([invented(), INVENTED[what]()])
     assert len(good["lines"]) == 5 and isinstance(bad, str)
+
+
+def test_more_registrations_than_anybody_checks_are_refused(javascript):
+    """Each costs two signatures of the CA: 25,000 in a file would take a browser ten minutes."""
+    registered = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
+    text = invented(lambda fields: [*fields[:3], fields[3] * (1_001 if fields[3][0][1][0] == registered else 1)])
+    with pytest.raises(VerificationError, match="more than 1,000 registrations"):
+        check(text, read_certificates((VECTORS / "ca.crt.pem").read_bytes()))
+    assert "more than 1,000 registrations" in javascript([text])[0]
 
 
 def test_a_proof_takes_no_more_steps_than_its_key_has_nibbles():
