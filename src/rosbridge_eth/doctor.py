@@ -510,4 +510,4 @@ def doctor(
         rows = [(f.what, _SIGN[f.result], f.found) for f in findings]
         data.print(table(f"The {kind}'s home {home}", ["what", "result", "found"], rows))
     if count:
-        raise BridgeError(f"{count} things are broken; each line above names the mend")
+        raise BridgeError(f"broken: {count}; each line above names the mend")

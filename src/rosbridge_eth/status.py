@@ -329,19 +329,19 @@ def _process(report: Report) -> list[tuple[str, object]]:
 
 
 def _robots(report: Report, *, money: bool = True) -> RenderableType:
-    columns, rows = ["robot", "session", "newest", "records/s", "waiting", "on chain", "Mgas"], []
+    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas"], []
     for name, robot in report["robots"].items():
         waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
         oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
-        block = f" ({robot['block']:.0f})" if robot.get("block") else ""
         rows.append((
             name, (session or robot["address"]) if robot["in_force"] else "revoked", span(robot.get("newest")),
             _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
-            _figure(robot, "chunks", ".0f") + block, f"{robot['gas'] / 1e6:.2f}" if "gas" in robot else "?",
+            _figure(robot, "chunks", ".0f"), _figure(robot, "block", ".0f"),
+            f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?",
             *([_figure(robot, "eth", ".4f"), _figure(robot, "days_left", ".1f")] if money else []),
         ))  # fmt: skip
-    title = "Robots: chunks that wait (how long) and that are on the chain (in which block the last)"
-    return table(title, [*columns, *(["ETH", "days"] if money else [])], rows, right=range(2, 9))
+    title = "Robots: chunks that wait (how long) and that are on the chain, up to a block"
+    return table(title, [*columns, *(["ETH", "days"] if money else [])], rows, right=range(2, 10))
 
 
 def _figure(of: Mapping[str, Any], key: str, form: str) -> str:

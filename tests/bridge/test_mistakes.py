@@ -152,4 +152,4 @@ def test_json_goes_to_stdout_and_words_to_stderr(place: Place) -> None:
     done = subprocess.run([sys.executable, "-m", "rosbridge_eth", "doctor", "--json"], capture_output=True, text=True,
                           env=environment, check=False)  # fmt: skip
     assert done.stdout.startswith("{") and done.stdout.count("\n") == 1
-    assert done.returncode == ExitCode.FAILED and "things are broken" in done.stderr
+    assert done.returncode == ExitCode.FAILED and "broken: 1; each line" in done.stderr

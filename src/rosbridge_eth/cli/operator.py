@@ -443,7 +443,7 @@ def _serve(
     secrets = Secrets(load_server_identity(place, passphrase), keys)
 
     def ready(address: tuple[str, int]) -> None:
-        talk(f"Listening on UDP {address[0]}:{address[1]} with {config.workers} workers; Ctrl-C ends it.")
+        talk(f"Listening on UDP {address[0]}:{address[1]} (workers: {config.workers}); Ctrl-C ends it.")
 
     with live(lambda: fleet(place)) as show:
 

@@ -240,7 +240,7 @@ def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Pla
         metrics.HELD.labels("robot_1").set(1)
         screen.print(module.fleet(place.operator))
     shown = screen.export_text()
-    assert re.search(r"robot_1 .* 192\.0\.2\.2 .* 7 \(5m\) .* 41 \(99\)", shown), shown
+    assert re.search(r"robot_1 .* 192\.0\.2\.2 .* 7 \(5m\) .* 41 +99 ", shown), shown
     assert "robot_1 is on hold" in shown and "has waited 5m" in shown
 
 
