@@ -48,7 +48,7 @@ class Followed:
         except IdentityError as error:
             if self.reading is None:
                 raise
-            raise ChainError(f"{error}, where it was before") from error  # the node is behind, or of another chain
+            raise ChainError(f"the node is behind, or of another chain: {error}") from error
         before, self._before = self._before, None  # it is used up, also where this one ends in the middle
         if before is None:
             self._until = inf if reading.kept is None else reading.top.number + MARGIN

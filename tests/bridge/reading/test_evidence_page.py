@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 
 from bridge.browser import Browser
-from bridge.reading.recorded import EVIL, ROOTS, Recorded, at, record
+from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, record
 from bridge.reading.test_evidence import rehung, start
-from bridge.reading.world import robot
+from bridge.reading.world import message, robot
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import create_ca
+from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.reading import Choice
 from rosbridge_eth.reading.evidence import Evidence, verify
 from rosbridge_eth.reading.verdict import grouped
@@ -89,6 +90,15 @@ def test_nothing_of_the_log_acts_on_the_page(browser: Browser, recorded: Recorde
     assert EVIL.replace("\u202e", "\\u202e") in said and "\u202e" not in said
     assert "4611686018427387904" in said
     assert browser.run("document.querySelectorAll('img').length") == 0
+
+
+def test_of_a_record_of_very_many_fields_the_page_shows_the_first(browser: Browser, tmp_path: Path):
+    with start() as node:
+        made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+        made.write(made.pen.write(message(at(1), "/many", **{f"f{n}": n for n in range(4_000)})))
+        said = show(browser, made.evidence(Choice("/many")).page(), tmp_path)
+    assert verdict(browser) == "good" and "more fields; the file has all" in said and "\nf4\n" in said
+    assert browser.run("document.querySelectorAll('.record dt').length") < 600
 
 
 def test_its_policy_lets_it_connect_to_nobody_and_run_no_other_script(browser: Browser, one: Evidence, tmp_path: Path):

@@ -272,7 +272,7 @@ def test_a_node_that_comes_back_without_the_robot_is_waited_for(chain: Chain, tm
     assert follow.look() == [0, 1]
     node._standing = {"account": None}
     chain.write(chain.pen.chunks(1))
-    assert follow.look() == [] and "where it was before" in follow.robots[0].trouble
+    assert follow.look() == [] and "behind, or of another chain" in follow.robots[0].trouble
     node._standing = {}
     assert follow.look() == [2] and not follow.robots[0].trouble and follow.verdict.sound
 
