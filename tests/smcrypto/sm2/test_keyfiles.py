@@ -549,7 +549,16 @@ def test_no_container_takes_anything_more(name: str) -> None:
             sm2.PublicKey.from_der(data)
 
 
-@pytest.mark.parametrize(("N", "r", "p"), [(2, 1, 1), (16, 8, 3), (1 << 14, 8, 1)])
+def test_iterations_are_bounded_when_a_key_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keyfiles, "MAX_ITERATIONS", 3)
+    for iterations in (1, 3):
+        assert len(keyfiles.write_pbes2(b"a key", b"pw", "sha256", iterations)[1]) == 16
+    for iterations in (0, 4):
+        with pytest.raises(InvalidOption, match="between 1 and 3"):
+            keyfiles.write_pbes2(b"a key", b"pw", "sha256", iterations)
+
+
+@pytest.mark.parametrize(("N", "r", "p"), [(2, 1, 1), (16, 8, 3), (16, 8, 64), (1 << 14, 8, 1)])
 def test_scrypt_as_hashlib_computes_it(N: int, r: int, p: int) -> None:
     key = hashlib.scrypt(b"pw", salt=b"salt", n=N, r=r, p=p, dklen=16)
     ciphertext = sm4.encrypt(key, sm4.CBC(bytes(16)), KEY.to_der(), padding="pkcs7")
