@@ -192,7 +192,9 @@ def receipt_of(nodes: Nodes, header: Header, index: int) -> bytes:
 
 def events_of(receipt: bytes, contract: bytes, tk: bytes, block: int) -> Iterator[DataEvent | RegistrationEvent]:
     """The robot's events in a receipt, in their order."""
-    *_, logs = _parts(receipt[1:] if receipt[:1] < b"\x80" else receipt, "sssl")
+    status, _, _, logs = _parts(receipt[1:] if receipt[:1] < b"\x80" else receipt, "sssl")
+    if logs != b"\xc0" and status != b"\x01":
+        raise VerificationError("a receipt shows events of a transaction that failed")
     for log in _items(logs):
         address, topics, data = _parts(log if isinstance(log, RlpList) else b"", "sls")
         named = items(topics, 4) if address == contract else []

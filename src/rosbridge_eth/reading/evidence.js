@@ -258,7 +258,9 @@ const evidence = (() => {
   }
 
   function certificate(der) {
-    const [tbs, algorithm, signature] = within(one(der), 0x30)
+    const parts = within(one(der), 0x30)
+    const [tbs, algorithm, signature] = parts
+    need(parts.length === 3, 'a certificate is not in the form of one')
     const [version, , inner, issuer, validity, subject, key, ...rest] = within(tbs, 0x30)
     need(version?.tag === 0xa0 && hex(version.content) === '020102', 'a certificate is not of version 3')
     for (const used of [algorithm, inner]) {
@@ -268,7 +270,11 @@ const evidence = (() => {
     need(hex(kind.whole) === SM2_KEY, 'a certificate is not for an SM2 key')
     const [from, until] = within(validity, 0x30).map(moment)
     const found = { tbs: tbs.whole, issuer: hex(issuer.whole), subject: hex(subject.whole), key: bits(point), from, until }
-    const [r, s] = within(one(bits(signature)), 0x30).map(({ content }) => big(content))
+    need(hex(algorithm.whole) === hex(inner.whole) && signature?.content[0] === 0, 'a certificate is not in the form of one')
+    const numbers = within(one(bits(signature)), 0x30)
+    const isOne = ({ tag, content }) => tag === 2 && content[0] < 0x80 && (content[0] > 0 || !(content[1] < 0x80))
+    need(numbers.length === 2 && numbers.every(isOne), 'a certificate is not DER')
+    const [r, s] = numbers.map(({ content }) => big(content))
     Object.assign(found, { r, s, authority: false, usage: null, purposes: [], names: [] })
     const extensions = rest.find(({ tag }) => tag === 0xa3)
     for (const extension of extensions ? within(one(extensions.content), 0x30) : []) {
@@ -403,7 +409,8 @@ const evidence = (() => {
   const REVOKED = topic('Revoked(bytes32,address,uint256,uint256)')
 
   function* eventsOf(receipt, contract, tk, block) {
-    const [, , , logs] = partsOf(receipt[0] < 0x80 ? receipt.subarray(1) : receipt, 'sssl', 'a receipt')
+    const [status, , , logs] = partsOf(receipt[0] < 0x80 ? receipt.subarray(1) : receipt, 'sssl', 'a receipt')
+    need(hex(status) === '01', 'a receipt is of a transaction that failed')
     for (const log of items(logs)) {
       const [address, topics, data] = partsOf(log.list, 'sls', 'a log')
       if (!same(address, contract)) continue

@@ -542,12 +542,22 @@ def with_log(n: int, part: Any) -> Callable[[list[Any]], Any]:
     return lambda fields: [*fields[:3], [[*fields[3][0][:n], part(fields[3][0][n]), *fields[3][0][n + 1 :]]]]
 
 
+def in_other_bytes(data: bytes) -> bytes:
+    """The first registration, a bit of the CA's signature said to be unused: another certificate, signed alike."""
+    found = re.search(rb"\x03[\x46-\x4a]\x00\x30", data)
+    if data[32:96] != bytes(63) + b"\x60" or not found:  # no registration, or one that follows another
+        return data
+    return data[: found.start() + 2] + b"\1" + data[found.start() + 3 :]
+
+
 INVENTED = {
     "logs as a string": lambda: invented(lambda fields: [*fields[:3], rlp.encode(fields[3])]),
     "a topic of 33 bytes": lambda: invented(with_log(1, lambda topics: [*topics[:2], b"\1" + topics[2], *topics[3:]])),
     "another place of the array": lambda: invented(
         with_log(2, lambda data: data[:63] + bytes([data[63] ^ 32 * (data[32:64] == (64).to_bytes(32))]) + data[64:])
     ),
+    "events of what failed": lambda: invented(lambda fields: [b"", *fields[1:]]),
+    "a signature in other bytes": lambda: invented(with_log(2, in_other_bytes)),
     "a receipt of five fields": lambda: invented(lambda fields: [*fields, b""]),
     "an extension without nibbles": lambda: invented(state=lambda account: rlp.encode([b"\0", account])),
 }  # fmt: skip
