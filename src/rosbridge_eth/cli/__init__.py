@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from rosbridge_eth import demo, doctor, status, topics
-from rosbridge_eth.cli import operator, reader, robot
+from rosbridge_eth.cli import handing, operator, reader, robot
 from rosbridge_eth.errors import BridgeError, ExitCode
 from rosbridge_eth.terminal import talk
 from smcrypto import __version__
@@ -31,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (demo, operator, robot, topics, reader, status, doctor):
+for part in (demo, operator, robot, topics, reader, handing, status, doctor):
     part.add_commands(app)
 
 

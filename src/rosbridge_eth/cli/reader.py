@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
-from datetime import UTC, datetime
-from itertools import islice
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
@@ -21,7 +20,7 @@ from rosbridge_eth.config.values import Address, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.passphrases import read_passphrase
-from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
+from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.config import ReaderConfig
@@ -36,13 +35,7 @@ def add_commands(app: typer.Typer) -> None:
         epilog="Examples: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl;"
         " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
     )(read)
-    app.command(
-        epilog="Example: rosbridge-eth grant robot_1 --from 2026-11-21T10:00:00Z --to 2026-11-21T10:05:00Z"
-        " --reader insurer.pem"
-    )(grant)
     app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
-    app.command(epilog="Example: rosbridge-eth evidence robot_1 crash.html --at 2026-11-21T10:00:00Z")(evidence)
-    app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
 
 
 RobotName: TypeAlias = Annotated[str, typer.Argument(help="The robot's name.")]
@@ -76,7 +69,7 @@ def _time(text: str | None) -> int | None:
         raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
 
 
-def _choice(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
+def choice_of(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
     from rosbridge_eth.reading import Choice
 
     choice = Choice(topic, _time(from_), _time(to), _time(at))
@@ -126,7 +119,7 @@ def read(
     """
     from rosbridge_eth.reading import outputs
 
-    choice, robot = _choice(topic, from_, to, at), [*dict.fromkeys(robot)]
+    choice, robot = choice_of(topic, from_, to, at), [*dict.fromkeys(robot)]
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     address = _address(serve)
@@ -155,7 +148,7 @@ def read(
         else:
             [name] = robot
             reading, of_it = stack.enter_context(
-                _reading(place, name, node, archive, confirmations, confirm, passphrase_file)
+                reading_of(place, name, node, archive, confirmations, confirm, passphrase_file)
             )
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
@@ -183,9 +176,9 @@ def read(
         of = made.summary
         talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
     if not follow and not chosen[name]:
-        _tell_topics(topic, reading)
+        tell_topics(topic, reading)
     for name, of_it in said.items():
-        _require_sound(place, name, of_it)
+        require_sound(place, name, of_it)
     if plot is not None and not picture.draw(plot):
         what = "a number there" if field else "a position"
         raise ConfigError(f"{plot} shows nothing: none of the {sum(chosen.values())} chosen records holds {what}")
@@ -214,7 +207,7 @@ def compare(
 
     place = ReaderHome(home).require()
     choice = comparing.time_of(bag)
-    with _reading(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
+    with reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
         made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
         said |= asdict(made)
     if json:
@@ -226,83 +219,9 @@ def compare(
     if made.absent:
         talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
     talk(f"{made.equal:,} records are equal to the bag's; {made.wrong:,} differences")
-    _require_sound(place, robot, said)
+    require_sound(place, robot, said)
     if made.wrong or not made.equal:
         raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
-
-
-def evidence(
-    robot: RobotName,
-    file: Annotated[Path, typer.Argument(help="The file to write; as a page that checks itself if it ends in .html.")],
-    home: ReaderHomeOption = READER_HOME,
-    topic: Topic = None,
-    from_: From = None,
-    to: To = None,
-    at: At = None,
-    node: Nodes = None,
-    archive: ArchiveUrl = None,
-    confirmations: Confirmations = 1,
-    confirm: Confirm = False,
-    passphrase_file: PassphraseFile = None,
-) -> None:
-    """Write one file that proves chosen records to somebody who has neither key nor node. It opens nothing else.
-
-    Exits with 9, like read, where the log that they are from is not sound; the file is written nevertheless.
-    """
-    from rosbridge_eth.files import write_atomically
-    from rosbridge_eth.reading import evidence as making
-
-    choice = _choice(topic, from_, to, at)
-    if choice == _choice(None, None, None, None):
-        raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
-    if file.exists() or not file.parent.is_dir():
-        raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
-    place = ReaderHome(home).require()
-    with _reading(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
-        records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
-        for _ in reading.chunks:
-            continue  # the verdict is on all of the log
-        if not records:
-            _tell_topics(topic, reading)
-            raise ConfigError("no record was chosen; nothing is written")
-        made = making.make(reading, records)
-    write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
-    talk(f"{file}: {len(made.records):,} records, for `verify {file} --ca ca.crt.pem`; who has it can read them")
-    _require_sound(place, robot, said)
-
-
-def verify(
-    file: Annotated[Path, typer.Argument(help="What `evidence` wrote, JSON or page.")],
-    ca: Annotated[Path, typer.Option(help="The CA's certificate (PEM): from the operator, not from who has the file.")],
-    node: Annotated[str | None, typer.Option(help="Ask this node whether the blocks are its chain's.")] = None,
-    json: Json = False,
-) -> None:
-    """Check evidence, without a node: what it shows goes to stdout as JSON lines, and what that proves is said.
-
-    Exits with 9 where anything does not hold, with 7 where the node named does not answer.
-    """
-    from rosbridge_eth.identity import read_certificates
-    from rosbridge_eth.reading import evidence as checking
-
-    data = read_given(file, checking.MAX_FILE + 1)
-    given = checking.Evidence.read(data)
-    found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
-    if node is not None:
-        checking.ask(found, node)
-        talk(f"holds: all {len(found.blocks)} blocks are those of the chain, says {node}")
-    if json:
-        print_json(found.as_json())
-    else:
-        for record in found.records:
-            print(record.json_line(), end="")
-    talk("What this proves:")
-    for line in found.proves():
-        talk(f"- {line}")
-    talk("What it does not prove:")
-    for line in found.proves_not("" if node is None else node):
-        talk(f"- {line}")
-    if data.strip().decode() not in (given.encode(), given.page().strip()):
-        talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
 
 
 def _bodies(config: ReaderConfig, given: str | None) -> Bodies | None:
@@ -331,7 +250,7 @@ class _Asked(NamedTuple):
 
 
 @contextmanager
-def _asking(
+def asking(
     place: ReaderHome, nodes: Sequence[str] | None, archive: str | None, confirmations: int, file: Path | None
 ) -> Iterator[_Asked]:
     from rosbridge_eth.identity import Trust, load_identity
@@ -359,63 +278,17 @@ def _asking(
         yield _Asked(identity, trust, ledgers, bookmarks, read)
 
 
-def grant(
-    robot: RobotName,
-    from_: Annotated[str, typer.Option("--from", help="Chunks that hold a message received from this time on,")],
-    to: Annotated[str, typer.Option(help="and before this time. Everything in these chunks is opened.")],
-    reader: Annotated[str, typer.Option(help="For whom: that reader's public.pem, or NAME for readers/NAME.pem.")],
-    out: Annotated[Path | None, typer.Option(help="The file to write; ROBOT-NAME.grant without it.")] = None,
-    home: ReaderHomeOption = READER_HOME,
-    node: Nodes = None,
-    archive: ArchiveUrl = None,
-    confirmations: Confirmations = 1,
-    confirm: Confirm = False,
-    passphrase_file: PassphraseFile = None,
-) -> None:
-    """Hand the keys of a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
-
-    They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
-    """
-    from rosbridge_eth.files import write_atomically
-    from rosbridge_eth.identity import Role, public_identity
-    from rosbridge_eth.reading import grant as granting
-
-    choice, place = _choice(None, from_, to, None), ReaderHome(home).require()
-    known = place.path / "readers" / f"{reader}.pem"
-    peer = public_identity(read_given(known if known.exists() else Path(reader)))
-    now = datetime.now(UTC)
-    with _asking(place, node, archive, confirmations, passphrase_file) as asked:
-        certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
-        peer = asked.trust.check(*certificates, role=Role.READER, at=now)
-        out = out or Path(f"{robot}-{peer.name}.grant")
-        if out.exists():
-            raise ConfigError(f"{out} is there already; name another with --out")
-        with _reading_as(asked, robot, confirm) as (reading, said):
-            keys = granting.keys_of(reading, choice)
-        if not keys:
-            raise ConfigError(f"this reader can open nothing of {robot} that was received in that time; see above")
-        made = granting.make(
-            keys, ledger=reading.verifier.log.ledger, robot=robot, begin=from_, end=to, by=asked.identity, to=peer,
-            now=now,
-        )  # fmt: skip
-    write_atomically(out, made, new=True)
-    chunks = f"{len(keys):,} chunk{'s' * (len(keys) > 1)}"
-    talk(f"{out} opens {chunks} of {robot} for reader {peer.name}, and for nobody else.")
-    talk(f"Whoever has {peer.name}'s home puts it into `grants/` there and runs: rosbridge-eth read {robot}")
-    _require_sound(place, robot, said)
-
-
 @contextmanager
-def _reading(
+def reading_of(
     place: ReaderHome, robot: str, nodes: Sequence[str] | None, archive: str | None, confirmations: int,
     confirm: bool, file: Path | None,
 ) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    with _asking(place, nodes, archive, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
+    with asking(place, nodes, archive, confirmations, file) as asked, reading_as(asked, robot, confirm) as found:
         yield found
 
 
 @contextmanager
-def _reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
+def reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
     """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
     said = dict[str, Any]()
     with closing(asked.read(robot, now=time.time())) as reading:
@@ -440,7 +313,7 @@ def _following(
     from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with _asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
+    with asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
         followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
         following = Following(followed, asked.ledgers)
         view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)
@@ -481,7 +354,7 @@ def _following(
             talk(line)
 
 
-def _tell_topics(topic: str | None, reading: Reading) -> None:
+def tell_topics(topic: str | None, reading: Reading) -> None:
     """Nothing was chosen: what there is, for who named a topic that is not there."""
     from rosbridge_eth.reading.verdict import shown
 
@@ -490,7 +363,7 @@ def _tell_topics(topic: str | None, reading: Reading) -> None:
         talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
 
 
-def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
+def require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
     if not said["sound"]:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
     if not said["records"] and "no-grant" in said["counts"]:
