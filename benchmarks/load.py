@@ -212,6 +212,7 @@ class Operator:
             where = EmbeddedChain(fund={self.keys.operator.address: RICH * 10**18})
         self._where = where
         self.deployment = deploy_contract(self.home, where, self.keys)
+        open_store(self.config, self.home).close()  # made before there are workers, as the supervisor does
         self.ledger = Ledger.connect(where, self.deployment)
         self.server = load_server_identity(self.home, self.passphrase)
         self.reader, roots = load_identity(self.reader_home.path, self.passphrase)

@@ -89,10 +89,8 @@ class Database:
             if self._exclusive:
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")  # and no -shm file, which would need room
             self._db.execute("PRAGMA temp_store = MEMORY")
-            # Another process may be making it just now, all of it at once: whoever sees a table sees the rest.
-            empty = self.one("SELECT count(*) FROM sqlite_master")[0] == 0
             found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]
-            if empty and found in (0, application) and not read_only:
+            if found == 0 and self.one("SELECT count(*) FROM sqlite_master")[0] == 0 and not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.executescript(
                     f"BEGIN IMMEDIATE; {schema} PRAGMA application_id = {application};"

@@ -82,12 +82,14 @@ def made(require: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory
 
 
 @pytest.fixture
-def place(made: tuple[Path, Anvil], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it. Passphrases are where a script would have them."""
+def place(made: tuple[Path, Anvil], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A copy of it, and the chain as it was. Passphrases are where a script would have them."""
     folder = shutil.copytree(made[0], tmp_path / "here")
     for name in WORDS:
         monkeypatch.setenv(f"ROSBRIDGE_ETH_{name.upper()}_PASSPHRASE_FILE", str(folder / "secrets" / name))
-    return folder
+    before = made[1].ask("evm_snapshot")
+    yield folder
+    made[1].ask("evm_revert", before)
 
 
 def test_ros_1(place: Path, require: Callable[[str], str]):

@@ -6,10 +6,7 @@ import shutil
 import sqlite3
 import stat
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
-from threading import Barrier
 
 import pytest
 
@@ -42,19 +39,6 @@ def numbers(inbox: SqliteInbox) -> list[int]:
 def test_the_file_is_for_its_owner_alone(path):
     open_file(path).close()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-
-
-def test_workers_that_make_the_file_at_the_same_time_have_one_inbox(tmp_path):
-    for number in range(20):
-        path, together = tmp_path / f"{number}.sqlite", Barrier(6)
-
-        def opened(path: Path = path, together: Barrier = together) -> bytes:
-            together.wait()
-            with closing(open_file(path)) as inbox:
-                return inbox.id
-
-        with ThreadPoolExecutor(6) as pool:
-            assert len({made.result() for made in [pool.submit(opened) for _ in range(6)]}) == 1
 
 
 def test_the_inbox_of_another_contract_is_refused(path):
