@@ -98,7 +98,7 @@ class Bucket(Archive):
             import obstore
             from obstore.store import S3Store
         except ImportError as error:
-            raise ConfigError("an archive in S3 takes obstore: pip install 'pysmcrypto[bridge,archive]'") from error
+            raise ConfigError("an archive in S3 takes obstore: pip install 'obstore<1'") from error
         self._obstore: Any = obstore
         self._url = str(config.url)
         bucket, _, prefix = self._url.removeprefix(S3).partition("/")
