@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -27,8 +28,12 @@ _CONNECT_TIME, _TIME = timedelta(seconds=5), timedelta(seconds=60)
 PROBE: Final = b"rosbridge-eth: whether this archive can be written and read\n"
 
 
+class ArchiveAway(StoreError):
+    """The archive does not answer, or refuses."""
+
+
 class Archive(Protocol):
-    """Every method may raise StoreError: the archive is away, or refuses."""
+    """Every method may raise ArchiveAway."""
 
     def put(self, digest: bytes, body: bytes) -> None:
         """Keep a body."""
@@ -44,7 +49,7 @@ class Archive(Protocol):
         digest = sm3.digest(PROBE)
         self.put(digest, PROBE)
         if self.get(digest, len(PROBE)) != PROBE:
-            raise StoreError(f"{self} does not give back what it was given")
+            raise ArchiveAway(f"{self} does not give back what it was given")
         return digest
 
 
@@ -52,7 +57,7 @@ class Folder(Archive):
     """A folder, which is there: one on a disk that is not mounted is not made in its place."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._synced = path, set[str]()
 
     def __str__(self) -> str:
         return f"the archive {self._path}"
@@ -61,29 +66,29 @@ class Folder(Archive):
     def _using(self, digest: bytes) -> Iterator[Path]:
         try:
             if not self._path.is_dir():
-                raise StoreError(f"{self} is not there; mount it, make the folder, or correct [archive] url")
+                raise ArchiveAway(f"{self} is not there; mount it, make the folder, or correct [archive] url")
             yield self._path / _name(digest)
         except OSError as error:
-            raise StoreError(f"{self} cannot be used: {error.strerror or error}") from error
+            raise ArchiveAway(f"{self} cannot be used: {error.strerror or error}") from error
 
     def put(self, digest: bytes, body: bytes) -> None:
         with self._using(digest) as path:
-            if not path.parent.is_dir():
+            if path.parent.name not in self._synced:  # whoever made it may not have come to that
                 path.parent.mkdir(exist_ok=True)
                 folder = os.open(self._path, os.O_RDONLY)
                 try:
                     os.fsync(folder)
                 finally:
                     os.close(folder)
+                self._synced.add(path.parent.name)
             write_atomically(path, body)
 
     def get(self, digest: bytes, length: int) -> bytes | None:
         with self._using(digest) as path:
-            try:
-                with path.open("rb") as file:
-                    return file.read(length + 1)
-            except FileNotFoundError:
+            if not path.is_file():  # nothing, or a pipe, which would be waited for
                 return None
+            with path.open("rb") as file:
+                return file.read(length + 1)
 
     def delete(self, digest: bytes) -> None:
         with self._using(digest) as path:
@@ -94,20 +99,13 @@ class Bucket(Archive):
     """A bucket, through obstore. Not to be carried over a fork. ConfigError without obstore, or for its keys."""
 
     def __init__(self, config: ArchiveConfig) -> None:
-        try:
-            import obstore
-            from obstore.store import S3Store
-        except ImportError as error:
-            raise ConfigError("an archive in S3 takes obstore: pip install 'obstore<1'") from error
+        settings = _settings(config)
+        import obstore
+        from obstore.store import S3Store
+
         self._obstore: Any = obstore
         self._url = str(config.url)
         bucket, _, prefix = self._url.removeprefix(S3).partition("/")
-        settings = {"endpoint": config.endpoint, "region": config.region}
-        if config.keys is not None:
-            words = read_file(config.keys, private=True).decode("ascii", "replace").split()
-            if len(words) != 2:
-                raise ConfigError(f"{config.keys} holds {len(words)} words; write the access key id and the secret")
-            settings["access_key_id"], settings["secret_access_key"] = words
         self._store: Any = S3Store(
             bucket, prefix=prefix or None, config={key: value for key, value in settings.items() if value},  # type: ignore[arg-type]
             client_options={
@@ -127,7 +125,7 @@ class Bucket(Archive):
         except (OSError, self._obstore.exceptions.BaseError) as error:  # its text goes on for pages
             text = one_line(str(error).partition("\n")[0])[:250]
             mend = "see that it is up, and that endpoint, region and keys in [archive] are right"
-            raise StoreError(f"{self} cannot be used: {text}; {mend}") from None
+            raise ArchiveAway(f"{self} cannot be used: {text}; {mend}") from None
 
     def put(self, digest: bytes, body: bytes) -> None:
         with self._using():
@@ -136,7 +134,13 @@ class Bucket(Archive):
     def get(self, digest: bytes, length: int) -> bytes | None:
         with self._using():
             try:
-                return bytes(self._obstore.get_range(self._store, _name(digest), start=0, length=length + 1))
+                body = bytearray()  # as much as is asked for, whatever the store sends
+                given = self._obstore.get(self._store, _name(digest), options={"range": (0, length + 1)})
+                for part in given.stream(min_chunk_size=65536):
+                    body += memoryview(part)[: length + 1 - len(body)]
+                    if len(body) > length:
+                        break
+                return bytes(body)
             except FileNotFoundError as error:
                 if "NoSuchBucket" in str(error):  # nothing is known of what it holds
                     raise
@@ -150,6 +154,25 @@ class Bucket(Archive):
 def open_archive(config: ArchiveConfig) -> Archive:
     """The archive that the configuration names; nothing is asked of it yet."""
     return Folder(config.url) if isinstance(config.url, Path) else Bucket(config)
+
+
+def check_settings(config: ArchiveConfig) -> None:
+    """ConfigError where `open_archive` raises one; loads nothing that must not be carried over a fork."""
+    if not isinstance(config.url, Path):
+        _settings(config)
+
+
+def _settings(config: ArchiveConfig) -> dict[str, str | None]:
+    """What a bucket's client is told. A bucket that locks its objects wants their checksum."""
+    if find_spec("obstore") is None:
+        raise ConfigError("an archive in S3 takes obstore: pip install 'obstore<1'")
+    settings = {"endpoint": config.endpoint, "region": config.region, "checksum_algorithm": "SHA256"}
+    if config.keys is not None:
+        words = read_file(config.keys, private=True).decode("ascii", "replace").split()
+        if len(words) != 2:
+            raise ConfigError(f"{config.keys} holds {len(words)} words; write the access key id and the secret")
+        settings["access_key_id"], settings["secret_access_key"] = words
+    return settings
 
 
 def _name(digest: bytes) -> str:

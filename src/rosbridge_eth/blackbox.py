@@ -175,7 +175,9 @@ class Ring:
     def take(self, at_ns: int) -> tuple[list[Record], Counter[str]]:
         """All that is kept at this time, which is then empty; and what had to go early, by topic."""
         self._forget(at_ns - self._length)
-        oldest, records = (at_ns - self._length) // SECOND, [*self._records]
+        oldest = (at_ns - self._length) // SECOND
+        # A clock that was set back leaves records of the future in front of older ones.
+        records = [record for record in self._records if record.received_ns >= at_ns - self._length]
         early = sum((held for second, held in self._early.items() if second >= oldest), Counter[str]())
         self._records.clear()
         self._definitions.clear()

@@ -12,6 +12,7 @@ import json
 import os
 import shutil
 import socket
+import struct
 import tempfile
 import threading
 import time
@@ -122,13 +123,24 @@ def _forget() -> None:
         gauge.clear()  # type: ignore[attr-defined]
 
 
+class _Shared(MultiProcessCollector):
+    """What all processes show; reads again where one is just making its file, which is empty for a moment."""
+
+    def collect(self) -> Any:
+        for _ in range(20):
+            with suppress(struct.error):
+                return super().collect()  # type: ignore[no-untyped-call]
+            time.sleep(0.05)
+        raise ValueError("the figures of a process are cut off")
+
+
 def collected(home: Path | None = None) -> CollectorRegistry:
     """The registry to show: of what runs with that home (ValueError where nothing does); without one, of all processes
     where they share a folder, else of this one."""
     if home is None and _ENVIRONMENT not in os.environ:
         return REGISTRY
     registry = CollectorRegistry()
-    MultiProcessCollector(registry, None if home is None else home / _LINK)  # type: ignore[no-untyped-call]
+    _Shared(registry, None if home is None else home / _LINK)  # type: ignore[no-untyped-call]
     return registry
 
 

@@ -44,6 +44,8 @@ MISMATCH = "the contract has other certificates for this robot; the operator's `
 NO_ARCHIVE = "it has no archive for chunks of topics with store = \"archive\"; its operator can name one in server.toml"
 PUTS = 4  # bodies put into the archive at once
 ROOM = 256 * 1024 * 1024  # bytes of chunks that are arriving or being put into the archive
+COST = 16 * 1024  # bytes beside a body: header, grants, objects
+HANGS = 60.0  # seconds in the archive's hands after which a body counts as not taken
 ROOM_OF_ONE = 48 * 1024 * 1024  # of one robot: what sender.AHEAD lets it have begun, one that is arriving, and some
 _NO_DIGEST = bytes(32)
 
@@ -97,7 +99,7 @@ class Reception:
     ) -> None:  # fmt: skip
         self._archive, self._threads = archive, ThreadPoolExecutor(PUTS, "archive")  # which starts them when needed
         self._arriving: dict[bytes, Arriving] = {}  # by Tk; outlives a session, so that the next one goes on with it
-        self._puts: list[tuple[bytes, Future[None], int]] = []  # Tk, work that may be going on, bytes
+        self._puts: list[tuple[bytes, Future[None], int, float]] = []  # Tk, work that may be going on, bytes, since
         self._probe = None if archive is None else self._threads.submit(archive.check)
         self.archive_trouble = Trouble(log, "the archive")
         self.server, self._inbox, self._ledger = server, inbox, ledger
@@ -160,11 +162,11 @@ class Reception:
                     return
                 why = session.mismatch
                 if isinstance(message, Offer) and chunk.header.archived and chunk.body:
-                    why = why or self._no_room(session, len(chunk.body), now)
+                    why = why or self._no_room(session, len(chunk.body) + COST, now)
                 if why is not None:
                     self._hold(session, why, now)
                     return
-                session.offers.append(self._offered(session, chunk))
+                session.offers.append(self._offered(session, chunk, now))
         if self._commit_at is None:
             self._commit_at = now + TURN
 
@@ -203,7 +205,7 @@ class Reception:
             if not front.header.archived or part.of != len(front.encoded) + front.header.body_length:
                 self.server.close_connection(session.connection, End.PROTOCOL)
                 return None
-            if (why := self._no_room(session, part.of, now)) is not None:
+            if (why := self._no_room(session, part.of + COST, now)) is not None:
                 self._hold(session, why, now)
                 return None
             arriving = self._arriving[session.tk] = Arriving(bytearray(), part.of, now)
@@ -224,9 +226,9 @@ class Reception:
         if self.archive_trouble.why is not None:
             return "the server's archive is away"
         self._puts = [one for one in self._puts if not one[1].done()]
-        if sum(used for tk, _, used in self._puts if tk == session.tk) + size > ROOM_OF_ONE:
+        if sum(used for tk, _, used, _ in self._puts if tk == session.tk) + size > ROOM_OF_ONE:
             return "as much as may be of this robot is on its way into the archive"
-        used = sum(used for _, _, used in self._puts)
+        used = sum(used for _, _, used, _ in self._puts)
         for tk, other in sorted(self._arriving.items(), key=lambda item: item[1].at):
             if used + sum(each.of for each in self._arriving.values()) + size <= ROOM or now - other.at <= ALIVE:
                 break
@@ -235,18 +237,24 @@ class Reception:
             return "as much as may be of all robots is on its way into the archive"
         return None
 
-    def _offered(self, session: Session, chunk: Chunk) -> Offered:
-        """The chunk for the next commit; a body for the archive is on its way there."""
+    def _offered(self, session: Session, chunk: Chunk, now: float) -> Offered:
+        """The chunk for the next commit; a body for the archive is on its way there, unless its number was taken."""
         archive, signer = self._archive, self._signer(session)
         if not chunk.header.archived or not chunk.body or archive is None:
             return Offered(chunk)
+        try:
+            head = self._inbox.head(session.tk, chunk.header.stream)
+        except StoreError:  # the commit finds that, too, and says so
+            head = None
+        if head is not None and chunk.header.number <= head.number:
+            return Offered(chunk.on_chain)
 
         def put() -> None:
             verify(*signer, chunk)
             archive.put(chunk.header.body_digest, chunk.body)
 
         work = self._threads.submit(put)
-        self._puts.append((session.tk, work, len(chunk.body)))
+        self._puts.append((session.tk, work, len(chunk.body) + COST, now))
         return Offered(chunk.on_chain, work)
 
     def _ready(self, session: Session, now: float) -> list[Chunk]:
@@ -269,8 +277,10 @@ class Reception:
                 self._hold(session, "the server's archive is away", now)
         return ready
 
-    def _look_at_archive(self) -> None:
+    def _look_at_archive(self, now: float) -> None:
         """Whether the archive works at the start, and whether one that was away is well again: a thread tries it."""
+        if any(not work.done() and now - since > HANGS for _, work, _, since in self._puts):
+            self.archive_trouble.now("it does not answer")
         if self._probe is not None and self._probe.done():
             error, self._probe = self._probe.exception(), None
             self.archive_trouble.now(None if error is None else str(error))
@@ -299,7 +309,7 @@ class Reception:
         if now >= self._look_at:
             self._look_at = now + LOOK_EVERY
             self._append([], now, wall)
-            self._look_at_archive()
+            self._look_at_archive(now)
             self.look(now)
 
     def commit(self, now: float, wall: float) -> None:
@@ -311,6 +321,8 @@ class Reception:
             self._take_outcome(session, chunk, outcome, now)
         for session in waiting:
             why = "the server's store is away" if outcomes is None else session.mismatch
+            if outcomes is None:  # what is behind a chunk that was not taken is not taken either
+                session.offers.clear()
             if why is not None:
                 self._hold(session, why, now)
             elif session.asked and not session.held:
@@ -343,11 +355,14 @@ class Reception:
                 if outcome is Outcome.STORED:
                     self.records[session.peer.name] += chunk.header.records
                     self.newest[session.peer.name] = chunk.header.sealed_ms / 1000
-                session.stream, session.asked = chunk.header.stream, True
+                if not session.asked:  # what the robot asks for is answered before what it did not
+                    session.stream, session.asked = chunk.header.stream, True
             case Outcome.DIFFERENT:
+                session.offers.clear()
                 if chunk.header.stream != session.refused:
                     self._refuse(session, chunk, "another chunk with this number is there")
             case Outcome.FULL:
+                session.offers.clear()
                 self._hold(session, "the room for this robot's chunks is full until some are on the chain", now)
 
     def _answer(self, session: Session, now: float) -> None:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 from rosbridge_eth import metrics
 from rosbridge_eth.administration import server_trust
-from rosbridge_eth.archive import open_archive
+from rosbridge_eth.archive import check_settings, open_archive
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
@@ -228,6 +228,8 @@ class Supervisor:
             ledger.check()
         with closing(open_store(config, self._home)) as inbox:
             inbox.check()
+        if config.archive is not None:
+            check_settings(config.archive)
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
         self._starts[name] += 1

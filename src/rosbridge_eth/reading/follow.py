@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Final
 
+from rosbridge_eth.archive import ArchiveAway
 from rosbridge_eth.errors import ChainError, IdentityError
 from rosbridge_eth.reading.fetch import MARGIN, Reading
 from rosbridge_eth.reading.verdict import Bookmarks, Kind, shown
@@ -98,7 +99,7 @@ class Following:
                 for record in robot.new(choice, clock()):
                     yield robot.name, record
                 robot.trouble = ""
-            except ChainError as error:
+            except (ChainError, ArchiveAway) as error:
                 robot.trouble = shown(str(error), 300)
                 if any(isinstance(head, bytes) for head in heads):
                     self._heads = []  # to be asked again without a new block

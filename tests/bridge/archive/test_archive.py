@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import os
 import random
 import threading
 from collections.abc import Iterator
@@ -155,3 +156,12 @@ def test_what_is_no_archive_is_refused_without_being_shown(url: str) -> None:
 def test_a_relative_folder_starts_at_the_configuration_file(tmp_path: Path) -> None:
     config = ArchiveConfig.model_validate({"url": "bodies"}, context={"folder": tmp_path})
     assert config.url == tmp_path / "bodies"
+
+
+def test_a_pipe_or_a_folder_by_the_name_of_a_body_is_no_body(tmp_path: Path) -> None:
+    archive, digests = Folder(tmp_path), [bytes([n]) * 32 for n in range(2)]
+    for digest in digests:
+        (tmp_path / digest.hex()[:2]).mkdir()
+    os.mkfifo(tmp_path / digests[0].hex()[:2] / digests[0].hex())
+    (tmp_path / digests[1].hex()[:2] / digests[1].hex()).mkdir()
+    assert [archive.get(digest, 100) for digest in digests] == [None, None]

@@ -212,6 +212,44 @@ def test_a_robots_chunks_wait_for_the_body_in_front_of_them_and_others_do_not(tm
     assert world.read() == world.lines
 
 
+@pytest.mark.parametrize("trouble", ["store away", "full"])
+def test_nothing_is_taken_behind_a_chunk_that_was_not(tmp_path: Path, trouble: str) -> None:
+    world = Archiving(tmp_path, 6, Faults())
+    world.threads.at_once = False
+    for _ in range(2):
+        world.image(100_000)
+    assert world.run(60, until=lambda: len(world.threads.waiting) == 2)
+    append, behind = world.inbox.append, world.threads.waiting.pop()
+
+    def once(chunks: Any, now: float) -> list[Outcome]:
+        if not chunks:
+            return append(chunks, now)
+        world.inbox.append = append  # type: ignore[method-assign]
+        if trouble == "full":
+            return [Outcome.FULL] * len(chunks)
+        raise StoreError("away")
+
+    world.inbox.append = once  # type: ignore[method-assign]
+    world.threads.work()
+    world.run(1, until=lambda: world.inbox.append == append)
+    world.threads.waiting.append(behind)
+    world.threads.at_once = True
+    world.threads.work()
+    assert world.run(60)
+    assert world.read() == world.lines
+    world.assert_linked()
+
+
+def test_an_archive_that_does_not_answer_is_one_that_is_away(tmp_path: Path) -> None:
+    world = Archiving(tmp_path, 6, Faults())
+    world.threads.at_once = False
+    world.image(100_000)
+    world.run(2 * server.HANGS, until=lambda: False)
+    assert world.reception.archive_trouble.why == "it does not answer"
+    world.image(100_000)
+    assert world.run(10, until=lambda: world.sender.statistics.held is not None)
+
+
 def test_an_archive_that_is_away_makes_robots_hold_until_it_is_back_and_nothing_is_lost(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -356,7 +394,26 @@ def test_what_arrives_is_bounded_for_one_robot_and_for_all(world: Archiving, mon
     assert not others  # nothing of it came for long: there is room again
 
 
-def test_a_chunk_that_is_known_is_answered_again_and_put_again_without_harm(world: Archiving) -> None:
+def test_many_small_chunks_are_bounded_by_what_they_take_and_not_by_their_bodies(
+    world: Archiving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.threads.at_once = False
+    monkeypatch.setattr(server, "ROOM_OF_ONE", 10 * server.COST)
+    for number in range(20):
+        world.offer(world.seal(100, number=number).encoded)
+    assert refused(world) == "as much as may be of this robot is on its way into the archive"
+    assert len(world.threads.waiting) == 9
+
+
+def test_a_chunk_whose_number_was_taken_leaves_no_body(world: Archiving) -> None:
+    for size in (100_000, 50_000):
+        world.offer(world.seal(size).encoded)
+        world.run(5, until=lambda: False)
+    assert world.reception.counts["different"] == 1
+    assert len(list((world.folder / "bodies").glob("*/*"))) == 1
+
+
+def test_a_chunk_that_is_known_is_answered_again(world: Archiving) -> None:
     chunk = world.seal(100_000)
     for _ in range(2):
         world.offer(chunk.encoded)

@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -168,3 +169,14 @@ def test_processes_share_their_figures_by_a_folder(tmp_path: Path):
     assert 'rosbridge_eth_beat_seconds{process="worker-0"} 15.0' in shown.stdout
     assert shown.stdout.count("rosbridge_eth_session_seen_seconds{") == 1
     assert "{'worker-0 runs': True}" in shown.stdout
+
+
+def test_figures_of_a_process_that_is_just_making_its_file_are_read_when_it_has_them(tmp_path: Path) -> None:
+    with metrics.shared(tmp_path):
+        metrics.beat("worker-0", 1.0)
+        made = tmp_path / metrics._LINK / "gauge_max_4711.db"
+        made.touch()
+        with pytest.raises(ValueError, match="cut off"):
+            metrics.figures(tmp_path)
+        threading.Timer(0.2, made.unlink).start()
+        assert metrics.figures(tmp_path)
