@@ -13,6 +13,8 @@ import geth_network
 import scale
 from conftest import unavailable
 
+pytestmark = [pytest.mark.service, pytest.mark.slow]
+
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
