@@ -289,7 +289,6 @@ def test_all_padding_failures_read_the_same() -> None:
     assert len(messages) == 1
 
 
-@pytest.mark.no_cover  # traced, it takes a minute
 @pytest.mark.parametrize("mode", [mode for mode in ALL if not isinstance(mode, sm4.OFB)], ids=name)
 def test_memory_stays_within_a_small_multiple_of_the_input(mode: sm4.Mode) -> None:
     """And what is worked on in several pieces is the same as what comes in several.
