@@ -20,15 +20,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Coverage is asked of the library alone; its tracing would make the bridge's tests take twice the time.
-
-    Files with slow tests go first, so that the quick ones fill the processes that are free at the end.
-    """
+    """Coverage is asked of the library alone; its tracing would make the bridge's tests take twice the time."""
     for item in items:
         if "bridge" in item.path.parts:
             item.add_marker(pytest.mark.no_cover)
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
 
 
 def unavailable(reason: str) -> None:
