@@ -174,11 +174,10 @@ class Ring:
 
     def take(self, at_ns: int) -> tuple[list[Record], Counter[str]]:
         """All that is kept at this time, which is then empty; and what had to go early, by topic."""
-        self._forget(at_ns - self._length)
-        oldest = (at_ns - self._length) // SECOND
-        # A clock that was set back leaves records of the future in front of older ones.
-        records = [record for record in self._records if record.received_ns >= at_ns - self._length]
-        early = sum((held for second, held in self._early.items() if second >= oldest), Counter[str]())
+        since_ns = at_ns - self._length
+        # All are looked at: a clock that was set back leaves records of the future in front of older ones.
+        records = [record for record in self._records if record.received_ns >= since_ns]
+        early = sum((held for second, held in self._early.items() if second >= since_ns // SECOND), Counter[str]())
         self._records.clear()
         self._definitions.clear()
         self._early.clear()
@@ -197,11 +196,11 @@ class Ring:
     def _size(self, record: Record, change: int) -> int:
         """Bytes that it takes, or gives back: its definition's if it is the first, or was the last, to refer to it."""
         definition = b"" if record.definition is None else record.definition[1]
-        before = self._definitions[definition]
+        others = self._definitions[definition] - (change < 0)
         self._definitions[definition] += change
         if not self._definitions[definition]:
             del self._definitions[definition]
-        return OVERHEAD + len(record.line) + (len(definition) if before + (change < 0) * -1 == 0 else 0)
+        return OVERHEAD + len(record.line) + (0 if others else len(definition))
 
 
 class Trigger:

@@ -148,6 +148,11 @@ class Header:
         """Whether the body's place is the archive."""
         return bool(self.flags & ARCHIVED)
 
+    @property
+    def max_line(self) -> int:
+        """Bytes of a line of it, at most."""
+        return MAX_ARCHIVED_LINE if self.archived else MAX_LINE
+
     def __str__(self) -> str:
         return f"chunk {self.number} of stream {self.stream.hex()[:8]}"
 

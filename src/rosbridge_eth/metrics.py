@@ -61,8 +61,10 @@ DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by r
 
 CHUNKS = _gauge("chunks", "Chunks that arrived since the process began, by what became of them.", "process", "outcome")
 STORED = _gauge("records_stored", "Lines of the log stored since the process began.", "process", "robot")
-RATE = _gauge("records_per_second", "Lines stored a second, over the last ten.", "robot")
-NEWEST = _gauge("newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "robot")
+RATE = _gauge("records_per_second", "Lines stored a second, over the last ten.", "process", "robot")
+NEWEST = _gauge(
+    "newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "process", "robot"
+)
 SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
 WAITING = _gauge("waiting_chunks", "Chunks in the inbox that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
@@ -117,6 +119,12 @@ def shared(home: Path) -> Iterator[None]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def forget_process(pid: int | None) -> None:
+    """Drop the figures of a process that has ended: those of the next one begin anew, and the old ones are not true."""
+    for file in Path(os.environ[_ENVIRONMENT]).glob(f"*_{pid}.db"):
+        file.unlink()
+
+
 def _forget() -> None:
     """A figure is kept where it was first set: let it be set anew."""
     for gauge in set(REGISTRY._names_to_collectors.values()):
@@ -124,11 +132,11 @@ def _forget() -> None:
 
 
 class _Shared(MultiProcessCollector):
-    """What all processes show; reads again where one is just making its file, which is empty for a moment."""
+    """What all processes show; reads again where a file is just made, and is empty for a moment, or just removed."""
 
     def collect(self) -> Any:
         for _ in range(20):
-            with suppress(struct.error):
+            with suppress(struct.error, FileNotFoundError):
                 return super().collect()  # type: ignore[no-untyped-call]
             time.sleep(0.05)
         raise ValueError("the figures of a process are cut off")
@@ -285,8 +293,8 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         CHUNKS.labels(process, outcome).set(count)
     for robot, records in reception.records.items():
         STORED.labels(process, robot).set(records)
-        RATE.labels(robot).set(_STORED_RATES.of(robot, records, wall))
-        NEWEST.labels(robot).set(reception.newest[robot])
+        RATE.labels(process, robot).set(_STORED_RATES.of(robot, records, wall))
+        NEWEST.labels(process, robot).set(reception.newest[robot])
     for session in reception.sessions.values():
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time

@@ -43,11 +43,20 @@ ALIVE = 10.0  # seconds after its last message in which a session counts as aliv
 MISMATCH = "the contract has other certificates for this robot; the operator's `status` says more"
 NO_ARCHIVE = "it has no archive for chunks of topics with store = \"archive\"; its operator can name one in server.toml"
 PUTS = 4  # bodies put into the archive at once
+HANGS = 60.0  # seconds for the archive to take a body, after which it counts as away
 ROOM = 256 * 1024 * 1024  # bytes of chunks that are arriving or being put into the archive
-COST = 16 * 1024  # bytes beside a body: header, grants, objects
-HANGS = 60.0  # seconds in the archive's hands after which a body counts as not taken
 ROOM_OF_ONE = 48 * 1024 * 1024  # of one robot: what sender.AHEAD lets it have begun, one that is arriving, and some
+COST = 16 * 1024  # bytes that count for each chunk beside its body: header, grants, objects
 _NO_DIGEST = bytes(32)
+
+
+class Put(NamedTuple):
+    """A body on its way into the archive: whose, the bytes that it counts, and when that began."""
+
+    tk: bytes
+    work: Future[None]
+    size: int
+    begun: float
 
 
 class Offered(NamedTuple):
@@ -99,7 +108,7 @@ class Reception:
     ) -> None:  # fmt: skip
         self._archive, self._threads = archive, ThreadPoolExecutor(PUTS, "archive")  # which starts them when needed
         self._arriving: dict[bytes, Arriving] = {}  # by Tk; outlives a session, so that the next one goes on with it
-        self._puts: list[tuple[bytes, Future[None], int, float]] = []  # Tk, work that may be going on, bytes, since
+        self._puts: list[Put] = []  # that may be going on
         self._probe = None if archive is None else self._threads.submit(archive.check)
         self.archive_trouble = Trouble(log, "the archive")
         self.server, self._inbox, self._ledger = server, inbox, ledger
@@ -225,15 +234,16 @@ class Reception:
             return NO_ARCHIVE
         if self.archive_trouble.why is not None:
             return "the server's archive is away"
-        self._puts = [one for one in self._puts if not one[1].done()]
-        if sum(used for tk, _, used, _ in self._puts if tk == session.tk) + size > ROOM_OF_ONE:
+        self._puts = [put for put in self._puts if not put.work.done()]
+        if sum(put.size for put in self._puts if put.tk == session.tk) + size > ROOM_OF_ONE:
             return "as much as may be of this robot is on its way into the archive"
-        used = sum(used for _, _, used, _ in self._puts)
+        total = size + sum(put.size for put in self._puts) + sum(each.of for each in self._arriving.values())
         for tk, other in sorted(self._arriving.items(), key=lambda item: item[1].at):
-            if used + sum(each.of for each in self._arriving.values()) + size <= ROOM or now - other.at <= ALIVE:
+            if total <= ROOM or now - other.at <= ALIVE:
                 break
+            total -= other.of
             del self._arriving[tk]
-        if used + sum(each.of for each in self._arriving.values()) + size > ROOM:
+        if total > ROOM:
             return "as much as may be of all robots is on its way into the archive"
         return None
 
@@ -254,7 +264,7 @@ class Reception:
             archive.put(chunk.header.body_digest, chunk.body)
 
         work = self._threads.submit(put)
-        self._puts.append((session.tk, work, len(chunk.body) + COST, now))
+        self._puts.append(Put(session.tk, work, len(chunk.body) + COST, now))
         return Offered(chunk.on_chain, work)
 
     def _ready(self, session: Session, now: float) -> list[Chunk]:
@@ -279,7 +289,7 @@ class Reception:
 
     def _look_at_archive(self, now: float) -> None:
         """Whether the archive works at the start, and whether one that was away is well again: a thread tries it."""
-        if any(not work.done() and now - since > HANGS for _, work, _, since in self._puts):
+        if any(not put.work.done() and now - put.begun > HANGS for put in self._puts):
             self.archive_trouble.now("it does not answer")
         if self._probe is not None and self._probe.done():
             error, self._probe = self._probe.exception(), None

@@ -233,6 +233,8 @@ class Supervisor:
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
         self._starts[name] += 1
+        if name in self._children:
+            metrics.forget_process(self._children[name].pid)
         process = _FORK.Process(target=_child, args=(name, self._starts[name], task), name=name, daemon=False)
         process.start()
         self._children[name], self._started_at[name] = process, time.monotonic()

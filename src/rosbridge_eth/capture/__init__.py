@@ -7,7 +7,7 @@ from rosbridge_eth.capture.conversion import Conversion
 from rosbridge_eth.capture.definitions import DefinitionError, normalised_type_name, read_definition
 
 from rosbridge_eth.capture.lines import (  # isort: skip
-    MAX_ARCHIVED_LINE, MAX_LINE, LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, definition_line, parse_line,
+    LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, definition_line, parse_line,
     stream_line, trigger_line,
 )  # fmt: skip
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage, Wire, decoder_for, decoder_for_known
@@ -16,7 +16,7 @@ from rosbridge_eth.capture.restoration import Restoration
 from rosbridge_eth.capture.rules import NamePattern, TopicRule
 
 __all__ = [
-    "MAX_ARCHIVED_LINE", "MAX_LINE", "Capture", "Captured", "Conversion", "DecodeError", "Decoder", "DefinitionError",
+    "Capture", "Captured", "Conversion", "DecodeError", "Decoder", "DefinitionError",
     "LostLine", "MessageLine", "NamePattern", "RawMessage", "Restoration", "StreamLine", "TopicRule", "TriggerLine",
     "TypeLine", "Wire", "decoder_for", "decoder_for_known", "definition_line", "normalised_type_name", "parse_line",
     "read_definition", "stream_line", "trigger_line",

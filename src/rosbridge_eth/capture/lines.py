@@ -23,12 +23,9 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import orjson
 
 from rosbridge_eth.capture.messages import Decoder, Wire, decoder_for
+from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import SourceError, VerificationError
 
-MAX_LINE: Final = 60 * 1024
-"""Bytes of a line, so that any line fits into a chunk by itself, even if it does not compress."""
-MAX_ARCHIVED_LINE: Final = 16 * 1024 * 1024 - 128 * 1024
-"""The same of a chunk for the archive."""
 MAX_DEPTH: Final = 100
 """Levels of nesting of a line; definitions of messages are nested less (capture.definitions)."""
 

@@ -16,9 +16,10 @@ from typing import Any, Final, NamedTuple
 import orjson
 
 from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
-from rosbridge_eth.capture.lines import MAX_ARCHIVED_LINE, MAX_LINE, lost_line
+from rosbridge_eth.capture.lines import lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
 from rosbridge_eth.capture.rules import NamePattern, Schedule, Selection, TopicRule, parse_paths, rule_for
+from rosbridge_eth.chunk import MAX_ARCHIVED_LINE, MAX_LINE
 from rosbridge_eth.errors import ConfigError
 
 MAX_CONVERSIONS: Final = 8

@@ -145,7 +145,7 @@ class Client:
 
     def statistics(self) -> Counter[str]:
         """What was counted since this client was made, each Drop among it, and whether it is connected."""
-        return self._counts + Counter(connections=int(self.state is State.CONNECTED))
+        return Counter({**self._counts, "connections": int(self.state is State.CONNECTED)})
 
     # What the network and the clock call
 

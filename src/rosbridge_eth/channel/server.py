@@ -156,8 +156,8 @@ class Server:
 
     def statistics(self) -> Counter[str]:
         """What was counted since this server was made, each Drop among it, and what is there at this moment."""
-        there = Counter(connections=len(self._by_name), half_open=len(self._half_open), early=self._early.kept)
-        return self._counts + there
+        there = {"connections": len(self._by_name), "half_open": len(self._half_open), "early": self._early.kept}
+        return Counter({**self._counts, **there})
 
     # What the network and the clock call
 

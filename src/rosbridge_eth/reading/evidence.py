@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
 
-from rosbridge_eth.capture import MAX_ARCHIVED_LINE, MAX_LINE, MessageLine, parse_line
+from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.chunk import Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
@@ -315,7 +315,7 @@ def _records_of(
                 signed[one.chunk] = _signed(log, one.chunk, encoded, certificates)
             header, line = signed[one.chunk], one.line.encode()
             check_proof(header.root, header.records, line, Proof(one.record, one.salt, tuple(one.path)))
-            content = parse_line(line, MAX_ARCHIVED_LINE if header.archived else MAX_LINE)
+            content = parse_line(line, header.max_line)
         except (VerificationError, UnicodeEncodeError) as error:
             raise VerificationError(f"{where}: {shown(str(error))}") from None
         if not isinstance(content, MessageLine):

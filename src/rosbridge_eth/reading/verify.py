@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from eth_utils.crypto import keccak
 
 from rosbridge_eth.capture import (  # isort: skip
-    MAX_ARCHIVED_LINE, MAX_LINE, LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line,
+    LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line,
 )  # fmt: skip
 from rosbridge_eth.chunk import (  # isort: skip
     Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id, signed_as,
@@ -362,7 +362,7 @@ class Verifier:
             if key and key == self._granted.get(place.digest):  # who gave it could open the chunk
                 raise VerificationError(f"a wrong key was granted for {chunk.header}: remove that grant") from None
             raise _Refused(Kind.UNOPENABLE, shown(str(error))) from None
-        records = tuple(self._parsed(place, lines, MAX_ARCHIVED_LINE if chunk.header.archived else MAX_LINE))
+        records = tuple(self._parsed(place, lines, chunk.header.max_line))
         self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
 

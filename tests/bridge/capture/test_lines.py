@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosbridge_eth.capture import (
-    MAX_LINE,
     LostLine,
     MessageLine,
     StreamLine,
@@ -26,6 +25,7 @@ from rosbridge_eth.capture import (
     trigger_line,
 )
 from rosbridge_eth.capture.definitions import MAX_KEPT
+from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import VerificationError
 
 LINE = (

@@ -6,8 +6,8 @@ from struct import pack
 
 import pytest
 
+from rosbridge_eth.capture import Capture as AnyCapture
 from rosbridge_eth.capture import (
-    MAX_LINE,
     Captured,
     LostLine,
     MessageLine,
@@ -17,8 +17,8 @@ from rosbridge_eth.capture import (
     decoder_for,
     parse_line,
 )
-from rosbridge_eth.capture import Capture as AnyCapture
 from rosbridge_eth.capture.process import MAX_CONVERSIONS
+from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import ConfigError
 
 NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")

@@ -400,7 +400,7 @@ def test_an_idle_session_is_kept_alive_and_a_dead_robot_is_forgotten():
     assert robot.client.statistics()["datagrams_sent"] - before <= 12  # one ping in ten seconds
     network.hosts.remove(robot.host)
     network.run(lambda: False, limit=60.0)
-    assert hub.server.statistics()["connections"] == 0
+    assert hub.server.statistics().items() >= {("connections", 0)}  # said: a gauge that is not set stays as it was
     assert [e.reason for e in hub.events if isinstance(e, Disconnected)] == [End.SILENT]
 
 

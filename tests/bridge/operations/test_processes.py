@@ -94,7 +94,7 @@ class Bridge:
                 if holds():
                     return
             time.sleep(0.2)
-        raise AssertionError(f"{what} within {PATIENCE:.0f} s; readyz: {ask(self.monitor, '/readyz')}")
+        raise AssertionError(f"{what} within {PATIENCE:.0f} s; figures: {self.figures()}")
 
     def ready(self) -> bool:
         return ask(self.monitor, "/readyz")[0] == 200
@@ -201,6 +201,7 @@ def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: B
         robot.send_signal(signal.SIGINT)
     assert robot.wait(30) == 0
     assert bridge.said("robot.log", "records captured in") == 2
+    bridge.until("seen to leave", lambda: bridge.figures()["channel connections"] == 0)
     bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
     verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
     assert verdict["sound"] and verdict["head"]["goodbye"]

@@ -201,8 +201,10 @@ def test_who_is_connected_and_what_comes_from_them_is_what_the_running_server_sh
         metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
         metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
         metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
-        metrics.RATE.labels("robot_1").set(12.5)
-        metrics.NEWEST.labels("robot_1").set(now - 30)
+        metrics.RATE.labels("worker-1", "robot_1").set(12.5)  # it moved from one worker to the other
+        metrics.RATE.labels("worker-0", "robot_1").set(0)
+        metrics.NEWEST.labels("worker-1", "robot_1").set(now - 30)
+        metrics.NEWEST.labels("worker-0", "robot_1").set(now - 300)
         metrics.GAS.labels("robot_1").set(123_000)
         report = status(capsys)
         robot = report["robots"]["robot_1"]

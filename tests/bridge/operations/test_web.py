@@ -171,6 +171,17 @@ def test_processes_share_their_figures_by_a_folder(tmp_path: Path):
     assert "{'worker-0 runs': True}" in shown.stdout
 
 
+def test_figures_end_with_their_process_when_the_next_one_is_started(tmp_path: Path):
+    with metrics.shared(tmp_path):
+        metrics.beat("worker-1", 1.0)
+        say = "from rosbridge_eth import metrics as m; m.RATE.labels('worker-0', 'robot_1').set(10)"
+        worker = subprocess.Popen([sys.executable, "-c", say])
+        assert worker.wait(30) == 0
+        assert ("records_per_second", {"process": "worker-0", "robot": "robot_1"}, 10) in metrics.figures(tmp_path)
+        metrics.forget_process(worker.pid)
+        assert metrics.figures(tmp_path) == [("beat_seconds", {"process": "worker-1"}, 1.0)]
+
+
 def test_figures_of_a_process_that_is_just_making_its_file_are_read_when_it_has_them(tmp_path: Path) -> None:
     with metrics.shared(tmp_path):
         metrics.beat("worker-0", 1.0)
