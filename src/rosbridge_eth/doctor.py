@@ -10,6 +10,7 @@ import http.client
 import json as jsonlib
 import os
 import socket
+import sqlite3
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -22,13 +23,14 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeAlias
 import typer
 
 from rosbridge_eth import identity as ids
+from rosbridge_eth.bundle import needs_password, read_bundle
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.database import InUse, NothingThere
-from rosbridge_eth.errors import BridgeError, NetworkError, StoreError
+from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError, StoreError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
@@ -71,6 +73,10 @@ def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Fi
     for what, check in checks.items():
         try:
             yield from check(home, secret)
+        except (OSError, sqlite3.Error) as error:
+            name = getattr(error, "filename", None)
+            yield broken(what, f"{f'{name}: ' if name else ''}{getattr(error, 'strerror', None) or error}",
+                         "see that it is there, whole, and this user's to read")
         except BridgeError as error:
             # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
             parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
@@ -218,9 +224,16 @@ def operator_configuration(home: Path, secret: bytes | None) -> Findings:
     yield ok("configuration", str(OperatorHome(home).config))
     robots = str(config.address_for_robots())
     for bundle in sorted(OperatorHome(home).bundles.glob("*.bundle")):
-        told = jsonlib.loads(bundle.read_bytes()).get("end", {}).get("server_address", robots)  # {}: a sealed one
+        content = bundle.read_bytes()
+        try:
+            told = robots if needs_password(content) else read_bundle(content).end.server_address
+            nowhere = parse_address(told).host in ANYWHERE
+        except (IdentityError, ValueError):
+            yield note("bundle", f"{bundle} was damaged",
+                       f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
+            continue
         if told != robots:
-            result = broken if parse_address(told).host in ANYWHERE else note
+            result = broken if nowhere else note
             yield result("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
                          f'write server = "{robots}" into the robot.toml of who joined with it')
 
@@ -376,11 +389,12 @@ def readers(home: Path, secret: bytes | None) -> Findings:
 
 def source(home: Path, secret: bytes | None) -> Findings:
     from rosbridge_eth.sources import open_source
+    from rosbridge_eth.topics import offered
 
     config = load_robot_config(RobotHome(home).config)
     settings, why = config.source_and_why(os.environ)
     with closing(open_source(settings, config.selection())) as opened:
-        offers = opened.offers()
+        offers = offered(opened)
     if settings.kind == "sim":
         yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
     elif not offers:

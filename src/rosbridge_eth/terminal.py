@@ -19,14 +19,15 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.logs import LogFormat, speaks_json
 
 log = logging.getLogger(__name__)
 
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
-data = Console(highlight=False)
+errors = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)  # else ":b:" of an address is a picture
+data = Console(highlight=False, emoji=False)
 
 OPERATOR_HOME, ROBOT_HOME, READER_HOME = Path("operator"), Path("robot"), Path("reader")
 
@@ -123,9 +124,12 @@ def print_json(value: Any) -> None:
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[int] = ()) -> Table:
     """A table whose cells are plain text; `right` are the columns aligned to the right."""
-    made = Table(title=title, title_justify="left", header_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    made = Table(
+        title=Text(title, "table.title"), title_justify="left", header_style="bold", box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
     for index, column in enumerate(columns):
         made.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
-        made.add_row(*(str(cell).replace("[", r"\[") for cell in row))
+        made.add_row(*(Text(str(cell)) for cell in row))
     return made

@@ -113,6 +113,7 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_cost
 
     source, stop, room = everything(config), threading.Event(), [ENOUGH]
+    timer = threading.Timer(seconds, stop.set)
     capture = Capture([*config.rules(), TopicRule("**")], source_kind=source.kind, live=True)
     whole = Capture([TopicRule("**", limit=ARCHIVE_LIMIT, archive=True)], source_kind=source.kind, live=True)
 
@@ -132,11 +133,11 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
 
     try:
         heard = {offer.topic: Heard(offer) for offer in offered(source)}
-        timer, began = threading.Timer(seconds, stop.set), time.monotonic()
+        began = time.monotonic()
         timer.start()
         source.run(take, stop)
-        timer.cancel()
     finally:
+        timer.cancel()
         source.close()
     times = [time for topic in heard.values() for time in topic.times]
     took = time.monotonic() - began if source.live else (max(times) - min(times)) / 1e9 if times else 0.0
@@ -216,7 +217,8 @@ def topics(
     if source is not None:
         named = parse_config(RobotConfig, robot_toml(["**"], source), place.config).source
         config = config.model_copy(update={"source": named})
-    report = survey(config, seconds, max(1, len([*place.readers.glob("*.pem")])))
+    joined = config.readers or [*place.readers.glob("*.pem")]
+    report = survey(config, seconds, len(config.reader_files(place.readers)) if joined else 1)
     if json:
         print_json(report)
         return

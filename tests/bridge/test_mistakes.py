@@ -147,6 +147,15 @@ def test_what_is_said_is_never_markup(capsys: Capture) -> None:
     assert "[red]x[/red] [/]" in capsys.readouterr().out
 
 
+def test_what_is_said_is_shown_letter_by_letter(capsys: Capture) -> None:
+    address, escaped = "[2001:db8:a:b::1]:7410", r"\[red]x"
+    terminal.talk(address)
+    terminal.data.print(terminal.table(r"\[red]of", ["a"], [[address], [escaped]]))
+    shown = capsys.readouterr()
+    assert shown.err == f"{address}\n", "and :b: is no picture"
+    assert address in shown.out and escaped in shown.out and r"\[red]of" in shown.out
+
+
 def test_json_goes_to_stdout_and_words_to_stderr(place: Place) -> None:
     environment = {**os.environ, "PYTHONPATH": SOURCE}
     done = subprocess.run([sys.executable, "-m", "rosbridge_eth", "doctor", "--json"], capture_output=True, text=True,

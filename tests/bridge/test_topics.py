@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from bridge.archive.bags import bag_of_images
 from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
-from rosbridge_eth.errors import ExitCode
+from rosbridge_eth.errors import ExitCode, SourceError
 from rosbridge_eth.ledger.contract import set_data_cost
-from rosbridge_eth.sources import sample_bag
+from rosbridge_eth.sources import BagSource, sample_bag
 from rosbridge_eth.topics import robot_toml
 
 Capture = pytest.CaptureFixture[str]
@@ -88,6 +89,35 @@ def test_every_reader_costs(capsys: Capture):
     one, all_of_them = survey(config, 5.0), survey(config, 5.0, MAX_READERS)
     grown = all_of_them["bytes_per_day"] / all_of_them["chunks_per_day"] - one["bytes_per_day"] / one["chunks_per_day"]
     assert grown == pytest.approx(15 * (8 + 113), abs=4), "docs/log.md: a tag and a wrapped key"
+
+
+def test_the_readers_that_robot_toml_names_are_those_that_cost(capsys: Capture):
+    Path("robot").mkdir()
+    for name in ("a.pem", "b.pem", "c.pem"):
+        Path("robot", name).touch()
+    taken = robot_toml(["/robot_1/odom"], BAG)
+    Path("robot/robot.toml").write_text(taken)
+    one = topics(capsys)
+    Path("robot/robot.toml").write_text('readers = ["a.pem", "b.pem", "c.pem"]\n' + taken)
+    three = topics(capsys)
+    grown = three["bytes_per_day"] / three["chunks_per_day"] - one["bytes_per_day"] / one["chunks_per_day"]
+    assert grown == pytest.approx(2 * (8 + 113), abs=4)
+
+
+def test_a_source_that_breaks_ends_the_listening_too(monkeypatch: pytest.MonkeyPatch):
+    from rosbridge_eth.topics import survey
+
+    def breaks(source: BagSource, emit: object, stop: object) -> None:
+        raise SourceError("the bag is cut off here")
+
+    monkeypatch.setattr(BagSource, "run", breaks)
+    Path("robot.toml").write_text(robot_toml(["**"], BAG))
+    before, config = {*threading.enumerate()}, load_robot_config(Path("robot.toml"))
+    with pytest.raises(SourceError):
+        survey(config, 30.0)
+    for thread in {*threading.enumerate()} - before:
+        thread.join(5.0)
+        assert not thread.is_alive(), "nothing waits for the time to pass"
 
 
 def test_where_there_is_no_source_it_says_how_to_name_one(capsys: Capture):

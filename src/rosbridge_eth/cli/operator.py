@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as jsonlib
-import shutil
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -254,6 +253,7 @@ def register(
     """
     from rosbridge_eth.administration import register_robot
     from rosbridge_eth.bundle import Request
+    from rosbridge_eth.files import write_atomically
     from rosbridge_eth.reading.verdict import grouped
 
     asked = None if request is None else Request.decode(terminal.read_given(request))
@@ -279,7 +279,8 @@ def register(
         talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
         return
     try:
-        shutil.copy(made.bundle, RobotHome(request.parent).answer)  # where the request lies in the robot's home
+        answer = RobotHome(request.parent).answer  # where the request lies in the robot's home
+        write_atomically(answer, made.bundle.read_bytes())  # which `robot` may look for at this moment
         where = "" if request.parent == terminal.ROBOT_HOME else f" --home {request.parent}"
         talk(f"Run there now: rosbridge-eth robot{where}")
     except (OSError, ConfigError):

@@ -14,7 +14,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from rosbridge_eth.config.models import SOURCE_KINDS, ReaderConfig, RobotConfig, Section, ServerConfig
@@ -44,7 +44,7 @@ def parse_config(model: type[_Config], text: str, file: Path) -> _Config:
     """The configuration in `text`; `file` is named in errors, and relative paths start at its folder."""
     try:
         values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also of a number with more digits than Python reads
         raise ConfigError(f"{file} is not TOML: {_decapitalised(str(error))}") from None
     try:
         return model.model_validate(values, context={"folder": file.parent})
@@ -103,7 +103,7 @@ def _problem(model: type[Section], detail: ErrorDetails, text: str) -> str:
     key = _key(location)
     kind, given, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "extra_forbidden":
-        sentence = _unknown(model, location)
+        sentence = _unknown(model, detail["loc"])
     elif kind == "missing":
         sentence = f"{key} is missing"
     elif kind == "literal_error":
@@ -138,8 +138,11 @@ def _choose(given: Any, allowed: Collection[str]) -> str:
 
 
 def _unknown(model: type[Section], location: Sequence[str | int]) -> str:
-    name, table = str(location[-1]), _key(location[:-1])
-    allowed = _allowed_keys(model, location[:-1])
+    name, table, holder = str(location[-1]), _key(_without_tags(location[:-1])), model
+    if len(location) > 1:  # no table holds another, but for those of a list, and a source is of one kind
+        of_field = _models_in(model.model_fields[str(location[0])].annotation)
+        holder = SOURCE_KINDS[str(location[1])] if location[0] == "source" else of_field[0]
+    allowed = sorted(field.alias or key for key, field in holder.model_fields.items())
     near = difflib.get_close_matches(name, allowed, 1)
     if name in REMOVED:
         hint = f"it is gone since the second edition: {REMOVED[name]}"
@@ -163,14 +166,8 @@ def _key(location: Sequence[str | int]) -> str:
     return words
 
 
-def _allowed_keys(model: type[Section], location: Sequence[str | int]) -> list[str]:
-    """The keys of the table at `location`: no table holds another, but for those of a list."""
-    tables = _models_in(model.model_fields[str(location[0])].annotation) if location else [model]
-    return sorted({field.alias or name for table in tables for name, field in table.model_fields.items()})
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _models_in(annotation: Any) -> list[type[Section]]:
+    if isinstance(annotation, type) and issubclass(annotation, Section):
         return [annotation]
     return [model for argument in get_args(annotation) for model in _models_in(argument)]
 

@@ -19,6 +19,7 @@ from pydantic import model_validator as validator
 from rosbridge_eth.blackbox import Condition, TriggerRule
 from rosbridge_eth.capture import NamePattern, TopicRule
 from rosbridge_eth.capture.rules import ARCHIVE_LIMIT, parse_paths
+from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size, to_path
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of
@@ -79,6 +80,7 @@ def _listed(value: Any) -> Any:
 
 
 _HOST = r"(?:\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]+)"
+_PORT = r"(?::(?:\d{1,4}|[1-5]\d{4}|6[0-4]\d{3}|65[0-4]\d\d|655[0-2]\d|6553[0-5]))?"  # up to 65535
 _PART = "[A-Za-z][A-Za-z0-9_]*"
 Pattern = Annotated[str, AfterValidator(_pattern)]
 FieldPath = Annotated[str, AfterValidator(_field_path)]
@@ -88,7 +90,7 @@ Store = Literal["chain", "archive"]
 Name = Annotated[str, _matching(
     r"[a-z0-9][a-z0-9_.\-]{0,62}", "a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")]
 MasterUri = Annotated[str, _matching(
-    rf"http://{_HOST}(?::\d{{1,5}})?/?", 'write the master\'s URI, such as "http://192.0.2.7:11311"')]
+    rf"http://{_HOST}{_PORT}/?", 'write the master\'s URI, such as "http://192.0.2.7:11311"')]
 Host = Annotated[str, _matching(
     r"[A-Za-z0-9_.\-]+|[0-9A-Fa-f]*:[0-9A-Fa-f]*:[0-9A-Fa-f:.]*", "write a name or an address, without a port")]
 Ros1Node = Annotated[str, _matching(
@@ -98,7 +100,7 @@ Ros2Node = Annotated[str, _matching(
 TopicPart = Annotated[str, _matching(
     r"[A-Za-z][A-Za-z0-9_]{0,62}", "it becomes part of a topic's name: letters, digits and _")]
 NodeUrl = Annotated[str, _matching(
-    rf"https?://(?:[^\s@/]+@)?{_HOST}(?::\d{{1,5}})?(?:[/?]\S*)?",
+    rf"https?://(?:[^\s@/]+@)?{_HOST}{_PORT}(?:[/?]\S*)?",
     'a node\'s URL; write "http://127.0.0.1:8545" or "https://..."', secret=True)]
 StoreUrl = Annotated[str, _matching(
     r"sqlite|rediss?://\S+|unix://\S+", 'a store; write "sqlite" or "redis://127.0.0.1:6379/0"', secret=True)]
@@ -133,7 +135,7 @@ class ArchiveConfig(Section):
 
     url: ArchiveUrl
     endpoint: Annotated[str, _matching(
-        rf"https?://{_HOST}(?::\d{{1,5}})?/?", 'write a URL without keys, such as "https://s3.example.org:9000"',
+        rf"https?://{_HOST}{_PORT}/?", 'write a URL without keys, such as "https://s3.example.org:9000"',
         secret=True)] | None = None
     region: str | None = None
     keys: FilePath | None = None
@@ -479,7 +481,7 @@ class RobotConfig(Section):
         return Selection([topic.topic for topic in self.topics], self.nodes)
 
     def reader_files(self, joined: Path) -> list[Path]:
-        """The readers' certificates: as configured, or those in the folder `joined`. ConfigError if there is none."""
+        """The readers' certificates, 1 to 16: as configured, or those in the folder `joined`. Else ConfigError."""
         files = sorted(joined.glob("*.pem")) if self.readers is None else self.readers
         if absent := [file for file in files if not file.is_file()]:
             raise ConfigError(f"reader certificate {absent[0]} does not exist; correct `readers`")
@@ -487,6 +489,11 @@ class RobotConfig(Section):
             raise ConfigError(
                 f"no reader: there is no certificate in {joined} and `readers` names none, so nobody could open the "
                 "records; join again with the bundle, or name a certificate in `readers`"
+            )
+        if len(files) > MAX_READERS:
+            raise ConfigError(
+                f"{len(files)} readers are too many, a chunk is for {MAX_READERS} at most; take certificates out of"
+                f" {joined if self.readers is None else '`readers`'}, and let more people share a reader's key"
             )
         return files
 

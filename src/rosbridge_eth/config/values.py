@@ -26,7 +26,8 @@ _PART = re.compile(r"(\d{1,9}(?:\.\d{1,9})?) ?(ms|s|m|h|d)", re.ASCII)
 _DURATION = re.compile(rf"{_PART.pattern}(?: ?{_PART.pattern})*", re.ASCII)
 _SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
 _SIZE = re.compile(r"(\d{1,12}(?:\.\d{1,6})?) ?(B|kB|MB|GB|KiB|MiB|GiB)", re.ASCII)
-_HOST_PORT = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.\-]{1,253}):(\d{1,5})", re.ASCII)
+_LABEL = r"[A-Za-z0-9_\-]{1,63}"  # of a name; a longer or an empty one is a defect to the resolver, not an answer
+_HOST_PORT = re.compile(rf"(\[[0-9A-Fa-f:.]+\]|(?=.{{1,253}}:){_LABEL}(?:\.{_LABEL})*\.?):(\d{{1,5}})", re.ASCII)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -34,10 +35,10 @@ def parse_duration(value: Any) -> int:
     """Nanoseconds."""
     if not isinstance(value, str) or not _DURATION.fullmatch(value):
         raise ValueError(f'is {value!r}; write a duration with its unit, such as "250ms", "2s", "5m", "1h30m", "7d"')
-    total = sum(float(number) * _UNITS_NS[unit] for number, unit in _PART.findall(value))
+    total = round(sum(float(number) * _UNITS_NS[unit] for number, unit in _PART.findall(value)))
     if not total:
         raise ValueError(f"is {value!r}; it has to be longer than nothing")
-    return round(total)
+    return total
 
 
 def parse_seconds(value: Any) -> float:

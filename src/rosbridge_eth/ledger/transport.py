@@ -217,7 +217,11 @@ class Node:
         limit_recursion()
         self._abi, self._session, self.url = abi, None, "embedded"
         if isinstance(where, str):
-            if not re.match("https?://[^/]", where):
+            try:
+                usable = re.match("https?://[^/]", where) is not None and urlsplit(where).port != 0
+            except ValueError:  # a port above 65535, or half an IPv6 address
+                usable = False
+            if not usable:
                 raise ConfigError('this is no URL of a node: write "http://127.0.0.1:8545" or "https://..."')
             self.url, self._session = shown(where), session()
             options = {"timeout": timeout, "allow_redirects": False}

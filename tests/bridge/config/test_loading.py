@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from rosbridge_eth import config as config_package
 from rosbridge_eth.capture import TopicRule
-from rosbridge_eth.chunk import ledger_id
+from rosbridge_eth.chunk import MAX_READERS, ledger_id
 from rosbridge_eth.config import (
     ReaderConfig,
     RobotConfig,
@@ -114,6 +114,10 @@ MISTAKES = {
     'topics = ["/a"]\nzzz = 1': "line 2: unknown key 'zzz'; allowed: capture, channel, log, monitor, nodes, ",
     'topics = [{topic = "/a", rat = 1}]': "line 1: unknown key 'rat' in topics[0]; did you mean 'rate'?",
     'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "line 2: unknown key 'sped' in source; did you mean 'speed'?",
+    # Of a source the keys of its kind, not those of another.
+    'topics = ["/a"]\nsource = {kind = "sim", path = "x"}': (
+        "line 2: unknown key 'path' in source; allowed: duration, kind, rate, robot, seed, speed"
+    ),
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
     "topics = []": "it names nothing to watch",
     'topics = "/a"': "line 1: topics is '/a'; it should be a list in [ ]",
@@ -175,6 +179,7 @@ MISTAKES = {
     "topics = [": "is not TOML: ",
     "topics = 1\ntopics = 2": "is not TOML: cannot overwrite a value",
     "\x00": "is not TOML: ",
+    f"topics = {'1' * 5000}": "is not TOML: exceeds the limit",
 }
 
 
@@ -198,6 +203,8 @@ def test_a_mistake_in_robot_toml_is_told(text):
         ("[chain]\nconfirmations = 101", "chain.confirmations is 101; it should be at most 100"),
         ("[batch]\nsize = 10", "unknown key 'batch'; it is gone since the second edition"),
         ('[chain]\nurl = "embedded"', "chain.url is not a node's URL"),
+        ('[chain]\nurl = "http://127.0.0.1:65536"', "chain.url is not a node's URL"),
+        ('listen = "a..b:7410"', "listen is 'a..b:7410'; write HOST:PORT"),
         ('[chain]\nurl = "ws://127.0.0.1:8546"', "chain.url is not a node's URL"),
         ('[store]\nshare = "1 kB"', "store.share is '1 kB'; it should be at least '1 MiB'"),
         ('name = "Server 1"', "line 1: name is 'Server 1'; a name has 1 to 63 of a-z"),
@@ -330,6 +337,16 @@ def test_no_reader_is_an_error_with_the_way_out(tmp_path):
         named.reader_files(tmp_path)
     (tmp_path / "alice.pem").write_text("")
     assert named.reader_files(tmp_path) == [tmp_path / "alice.pem"]
+
+
+def test_more_readers_than_a_chunk_is_for_are_told_before_anything_is_sealed(tmp_path):
+    config = robot('topics = ["/a"]')
+    for number in range(MAX_READERS):
+        (tmp_path / f"{number}.pem").write_text("")
+    assert len(config.reader_files(tmp_path)) == MAX_READERS
+    (tmp_path / "more.pem").write_text("")
+    with pytest.raises(ConfigError, match="17 readers are too many, a chunk is for 16"):
+        config.reader_files(tmp_path)
 
 
 def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):

@@ -32,7 +32,8 @@ def test_durations(text, expected):
     assert parse_seconds(text) == expected / 1e9
 
 
-@pytest.mark.parametrize("value", ["", "2", "s", "2x", "-2s", "2s3", "0s", "1e3s", "2S", 2, 2.0, True, None, [], "²s"])
+@pytest.mark.parametrize("value", ["", "2", "s", "2x", "-2s", "2s3", "0s", "1e3s", "2S", 2, 2.0, True, None, [], "²s",
+                                   "0.0000001ms"])
 def test_what_is_no_duration(value):
     with pytest.raises(ValueError, match=r'such as "250ms"|longer than nothing'):
         parse_duration(value)
@@ -95,7 +96,8 @@ def test_addresses(text, host, port):
 
 
 @pytest.mark.parametrize(
-    "value", ["", "host", ":7410", "host:", "host:65536", "host:-1", "2001:db8::7:7410", "a b:1", 7410]
+    "value", ["", "host", ":7410", "host:", "host:65536", "host:-1", "2001:db8::7:7410", "a b:1", 7410,
+              "a..b:1", ".a:1", f"{'a' * 64}.example:1", f"{'a.' * 127}:1"]
 )
 def test_what_is_no_address(value):
     with pytest.raises(ValueError, match="write HOST:PORT"):

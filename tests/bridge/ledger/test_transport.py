@@ -279,7 +279,9 @@ def test_access_keys_and_control_characters_are_not_shown():
     assert "refused" in str(caught.value)
 
 
-@pytest.mark.parametrize("url", ["nonsense", "file:///etc/passwd", "http://", "127.0.0.1:8545", ""])
+@pytest.mark.parametrize("url", [
+    "nonsense", "file:///etc/passwd", "http://", "127.0.0.1:8545", "", "http://127.0.0.1:65536", "http://[::1",
+])
 def test_what_is_no_url_of_a_node_is_told_as_that(url: str):
     with pytest.raises(ConfigError, match="no URL of a node"):
         Ledger(url, CONTRACT)

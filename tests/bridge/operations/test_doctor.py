@@ -32,6 +32,7 @@ from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.registry import Registry
+from rosbridge_eth.sources import Offer
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -131,6 +132,9 @@ ODOM = 'topics = ["/robot_1/odom"]\n'
     ("robot", lambda p: (p / "robot/robot.toml").write_text(ODOM), "source", 'kind = "ros1"'),
     ("robot", lambda p: (p / "robot/bridge.json").write_text("{"), "configuration", "join again"),
     ("robot", lambda p: (p / "robot/bridge.json").unlink(), "configuration", "register"),
+    ("robot", lambda p: (p / "robot/identity/ca.crt.pem").unlink(), "readers", "ca.crt.pem"),
+    ("operator", lambda p: (p / "operator/server/ca.crt.pem").unlink()
+        or (p / "operator/server/ca.crt.pem").mkdir(), "server's certificates", "ca.crt.pem"),
     ("operator", lambda p: (p / "operator/server/enc.key.pem").chmod(0o640), "key files", "chmod 600"),
     ("operator", lambda p: (p / "operator/accounts.json").chmod(0o604), "key files", "chmod 600"),
     ("operator", lambda p: (p / "operator/server.toml").write_text("listen = 1"), "configuration", ""),
@@ -155,6 +159,33 @@ def test_what_is_broken_is_found_and_nothing_is_changed(
     assert found, findings
     assert mend in found[0]["mend"] + found[0]["found"]
     assert files(place.path / home) == before
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"format": "rosbridge-eth bundle 2"}'])
+def test_a_damaged_bundle_is_noted_with_the_way_to_another(
+    place: Place, on_chain: None, content: bytes, capsys: Capture
+):
+    (place.operator.bundles / "robot_1.bundle").write_bytes(content)
+    code, findings = doctor(capsys, "--passphrase-file", "pass")
+    assert code == 0, findings
+    assert "register robot_1 REQUEST --replace" in of(findings, "bundle")["mend"]
+
+
+def test_a_live_graph_is_given_the_time_to_be_found(place: Place, monkeypatch: Patch, capsys: Capture):
+    """Discovery takes ROS 2 a second or two."""
+    looks = iter([[], [], [Offer("/odom", "nav_msgs/msg/Odometry")]])
+    last: list[Offer] = []
+
+    def offers() -> list[Offer]:
+        last[:] = next(looks, last)
+        return [*last]
+
+    graph = SimpleNamespace(live=True, offers=offers, close=lambda: None)
+    monkeypatch.setattr("rosbridge_eth.sources.open_source", lambda settings, selection: graph)
+    monkeypatch.setattr("rosbridge_eth.topics.SETTLED", 0.01)
+    place.robot.config.write_text(f'{ODOM}[source]\nkind = "ros2"\n')
+    _, findings = doctor(capsys, "--home", "robot")
+    assert of(findings, "source")["result"] == "ok" and "1 topics" in of(findings, "source")["found"]
 
 
 @pytest.mark.parametrize("home, secret", [("operator", "pass"), ("reader", "readers")])
