@@ -40,7 +40,7 @@ from rosbridge_eth.home import (
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
-from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.ledger.contract import BALANCE_LIMIT, WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.registry import OWNER, Registry
 from smcrypto import InvalidKey, sm2
@@ -323,7 +323,7 @@ def _make_reader(
 class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
-    own_keys: nobody but the robot can sign as it. funded: False where the operator's account has no ETH for it; the
+    own_keys: nobody but the robot can sign as it. unfunded: why its account was given no ETH, if it was not; the
     server gives it some later. buried: chunks of the one that bore the name before which became dead letters.
     """
 
@@ -332,7 +332,7 @@ class Registered(NamedTuple):
     block: int
     bundle: Path
     own_keys: bool
-    funded: bool
+    unfunded: str | None
     buried: int
 
 
@@ -395,13 +395,15 @@ def register_robot(
     made = Bundle(end, text, readers, private)
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
-    funded = True
+    unfunded = None
     try:
-        if ledger.balance(account) < int(config.funds.below * WEI_PER_ETH):  # so that its first chunk need not wait
-            ledger.alloc_eth(keys.operator, account, int(config.funds.by * WEI_PER_ETH))
+        if (has := ledger.balance(account)) < int(config.funds.below * WEI_PER_ETH):  # its first chunk need not wait
+            ledger.alloc_eth(keys.operator, account, min(int(config.funds.by * WEI_PER_ETH), BALANCE_LIMIT - has))
     except OutOfFunds:
-        funded = False
-    return Registered(name, account, block, path, request is not None, funded, buried)
+        unfunded = "the operator's account has none for it"
+    except ChainError as error:
+        unfunded = str(error)
+    return Registered(name, account, block, path, request is not None, unfunded, buried)
 
 
 def _register(
@@ -466,9 +468,10 @@ def revoke(
         in_force = registry.revoke(role, name, now)
     nobody = f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
     if role is not Role.ROBOT:
+        if known:  # also where it was cut short before
+            (home.readers / f"{name}.pem").unlink(missing_ok=True)
         if not in_force:
             raise IdentityError(nobody)
-        (home.readers / f"{name}.pem").unlink(missing_ok=True)
         return Revoked(None)
     tk = robot_id(name)
     try:

@@ -13,13 +13,15 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from rosbridge_eth import identity as ids
+from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
 from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, new_home, require_empty
-from rosbridge_eth.identity import KEY_FILES, check_name
+from rosbridge_eth.identity import CERTIFICATE_FILES, KEY_FILES, check_name
 from smcrypto import SMCryptoError, sm2, x509
 
 FIRST_CONFIG = """\
@@ -85,16 +87,20 @@ def needs_password(data: bytes) -> bool:
 
 def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
     """The bundle in `data`; IdentityError where it is none, was altered, or the password is another."""
-    content: dict[str, Any] = box_head(data, BUNDLE)
+    content = box_head(data, BUNDLE)
     try:
         if "sealed" in content:
             content = json.loads(open_box(data, password or b"", BUNDLE)[1])
-        end = BridgeEnd(**content["end"])
-        for name in (end.robot, *content["readers"]):  # they become names of files
+        bundle = TypeAdapter(Bundle).validate_python(content)
+        for name in (bundle.end.robot, *bundle.readers):  # they become names of files, as the next two do
             check_name(name)
-        return Bundle(end, dict(content["certificates"]), dict(content["readers"]), dict(content["keys"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise IdentityError("this bundle file was damaged") from error
+        if bundle.certificates.keys() != set(CERTIFICATE_FILES) or bundle.keys.keys() not in (set(), set(KEY_FILES)):
+            raise ValueError
+        if not (bundle.end.ledger and parse_address(bundle.end.server_address)):  # each raises where it is none
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise IdentityError("this bundle file was damaged") from None
+    return bundle
 
 
 # On the robot

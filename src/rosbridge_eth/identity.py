@@ -40,7 +40,7 @@ SIGNING_USAGE = ("digitalSignature",)
 ENCRYPTION_USAGE = ("keyEncipherment", "dataEncipherment", "keyAgreement")
 
 KEY_FILES = ("sign.key.pem", "enc.key.pem")
-_FILES = (*KEY_FILES, "sign.crt.pem", "enc.crt.pem", "ca.crt.pem")
+CERTIFICATE_FILES = ("sign.crt.pem", "enc.crt.pem", "ca.crt.pem")
 
 
 class Role(StrEnum):
@@ -345,7 +345,7 @@ def identity_from_files(
     files: Mapping[str, bytes], password: bytes | None
 ) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """The reverse of `identity_files`: the identity and the roots. Keys must belong to their certificates."""
-    if missing := [name for name in _FILES if name not in files]:
+    if missing := [name for name in (*KEY_FILES, *CERTIFICATE_FILES) if name not in files]:
         raise IdentityError(f"the identity is not complete: {', '.join(missing)} missing")
     peer = public_identity(files["sign.crt.pem"] + files["enc.crt.pem"])
     keys = []
@@ -377,4 +377,5 @@ def save_identity(folder: Path, identity: Identity, roots: Sequence[x509.Certifi
 
 def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """Read what `save_identity` wrote; a key file that others may read is refused."""
-    return identity_from_files({name: read_file(folder / name, private=name in KEY_FILES) for name in _FILES}, password)
+    names = (*KEY_FILES, *CERTIFICATE_FILES)
+    return identity_from_files({name: read_file(folder / name, private=name in KEY_FILES) for name in names}, password)

@@ -84,9 +84,10 @@ class Capture:
         self.take_up(rules)
 
     def take_up(self, rules: Sequence[TopicRule]) -> None:
-        """Go on by other rules. A topic whose rule stays the same goes on as it is. Raises ValueError."""
-        self._rules = [(NamePattern(rule.topic), rule) for rule in rules]
-        self._selections = {id(rule): parse_paths(rule.fields) for rule in rules}
+        """Go on by other rules. A topic whose rule stays the same goes on as it is. ValueError: by the old ones."""
+        patterns, selections = [NamePattern(rule.topic) for rule in rules], [parse_paths(rule.fields) for rule in rules]
+        self._rules = list(zip(patterns, rules, strict=True))
+        self._selections = dict(zip(rules, selections, strict=True))
         self._topics = {name: topic for name, topic in self._topics.items()
                         if topic is not None and topic.rule == rule_for(name, self._rules)}  # fmt: skip
 
@@ -151,7 +152,7 @@ class Capture:
     def _topic(self, name: str) -> _Topic | None:
         if name not in self._topics:
             rule = rule_for(name, self._rules)
-            self._topics[name] = None if rule is None else _Topic(rule, self._selections[id(rule)], Schedule(rule))
+            self._topics[name] = None if rule is None else _Topic(rule, self._selections[rule], Schedule(rule))
         return self._topics[name]
 
     def _compile(self, topic: _Topic, decoder: Decoder) -> Conversion:

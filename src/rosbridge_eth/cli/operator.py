@@ -270,8 +270,8 @@ def register(
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if not made.own_keys:
         talk(f"Its keys were made here: who has this home and its passphrase can sign as {name}.")
-    if not made.funded:
-        talk("The operator's account has no ETH for it; nothing is written for it until there is some.")
+    if made.unfunded:
+        talk(f"It was given no ETH yet ({made.unfunded}); nothing is written for it until the server can give it some.")
     if made.buried:
         talk(f"{made.buried} chunks of the old {name} are dead letters now; `status` lists them.")
     talk(f"The CA is {grouped(ca.certificate.fingerprint().hex())}.")

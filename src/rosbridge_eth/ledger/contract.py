@@ -352,8 +352,10 @@ class Ledger:
             if not found or found[-1].block != block:
                 raise ChainError(f"{self.url} has no batch of this robot in block {block}, where one must be")
             yield from reversed(found)
-            if found[0].previous_block >= block:
-                raise ChainError(f"{self.url} names a batch before that of block {block} which is not before it")
+            if found[0].previous_block >= found[0].block:
+                raise ChainError(
+                    f"{self.url} names a batch before that of block {found[0].block} which is not before it"
+                )
             block, span = found[0].previous_block, min(2 * span, most)
 
     def registrations(self, tk: bytes, standing: Standing) -> list[RegistrationEvent]:
@@ -470,17 +472,18 @@ class Ledger:
     ) -> Receipt:
         """Behind what the account has in the pool; again with the next number if another transaction took its own."""
         deadline, signed, nonce, pause = time.monotonic() + wait, None, 0, 0.02
+        refused: ChainError | None = None
         while time.monotonic() < deadline:
             if signed is None:
                 [(_, nonce)] = self.nonces([account.address])
                 signed = self.sign(
                     account, data, nonce=nonce, gas=gas, fees=self.fees(self.block()), value=value, creates=creates
                 )
-                [error] = self.send([signed.raw])
-                if isinstance(error, NonceTooLow | Underpriced):
-                    signed = None  # somebody else was faster
-                elif error is not None and not isinstance(error, AlreadyKnown):
-                    raise error
+                [refused] = self.send([signed.raw])
+                if isinstance(refused, NonceTooLow | Underpriced):
+                    signed = None  # somebody else was faster, or the price rose
+                elif refused is not None and not isinstance(refused, AlreadyKnown):
+                    raise refused
             elif (receipt := self.receipt(signed.hash)) is not None:
                 if not receipt.succeeded:
                     raise transport.Reverted(f"transaction 0x{signed.hash.hex()} failed in block {receipt.block}")
@@ -489,6 +492,8 @@ class Ledger:
                 signed = None
             time.sleep(pause)
             pause = min(2 * pause, 1.0)
+        if isinstance(refused, NonceTooLow | Underpriced):
+            raise refused
         raise ChainError(
             f"{self.url} took the transaction, but no block holds it after {wait:.0f} s; "
             "look whether the chain makes blocks and whether the fee is enough, then look again"

@@ -208,7 +208,10 @@ class Anvil:
             return
         state = json.loads(gzip.decompress(bytes.fromhex(self.ask("anvil_dumpState")[2:])))
         content = json.dumps(_trimmed(state)).encode()
-        write_atomically(self._state, content)
+        try:
+            write_atomically(self._state, content)
+        except OSError as error:
+            raise ChainError(f"{self._state} cannot be written: {error.strerror}") from error
         self._saved, self.state_size = head, len(content)
         while self.state_size >= self._told:
             log.warning(
@@ -229,13 +232,15 @@ class Anvil:
             pause = max(SAVE_SECONDS, SAVE_SHARE * (time.monotonic() - began))
 
     def stop(self) -> None:
-        """Save the state, let it end; kill it if it does not."""
-        if self._saver.is_alive():
-            self._stopped.set()
-            self._saver.join()
-            if self.running():
-                self.save()
-        self._end(signal.SIGINT)
+        """Save the state, let it end; kill it if it does not. ChainError where the last of it could not be saved."""
+        try:
+            if self._saver.is_alive():
+                self._stopped.set()
+                self._saver.join()
+                if self.running():
+                    self.save()
+        finally:
+            self._end(signal.SIGINT)
 
     def kill(self) -> None:
         """As a power cut would."""

@@ -185,13 +185,14 @@ class Submitter:
                 else:
                     account.hold, account.flights = None, []
             except _Hold as why:
-                account.hold = str(why)
+                account.hold, account.flights = str(why), []
             certificates = contract.NOTHING if standing.revoked else standing.certificates_hash
             self._inbox.set_state(tk, hold=account.hold, certificates_hash=certificates)
         if head.base_fee is not None and head.base_fee > self._settings.max_fee:
             self.trouble = f"a unit of gas costs {head.base_fee / 10**9:.1f} gwei, which is above max_fee_gwei"
-        elif work:
-            self._send(work, head, now)
+        else:
+            if work:
+                self._send(work, head, now)
             self._top_up(work, funds, now)
         return bool(work)
 
@@ -397,7 +398,7 @@ class Submitter:
         daily = self._settings.gas_per_day
         account.gas = min(daily, account.gas + max(0.0, now - account.gas_at) * daily / DAY)
         account.gas_at = now
-        if account.gas < gas:
+        if account.gas < min(gas, daily):  # a batch above a day's gas takes that of the days after it, too
             return False
         account.gas -= gas
         return True
@@ -441,6 +442,8 @@ class Submitter:
             cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
             if w.standing.balance < min(max(self._settings.low_water, cost), contract.BALANCE_LIMIT // 2):
                 poor.append(w.standing)
+        if not poor:
+            self.funds = None
         if self._operator is None or not poor or (pending > latest and not funds.due(now)):
             return
         stuck = pending > latest

@@ -107,14 +107,18 @@ class BagSource(Source):
         return sum(connection.msgcount for connection, _, _ in self._connections if connection.id in self._decoders)
 
     def messages(self) -> Iterator[RawMessage]:
-        """The watched messages, in order, without waiting. Raises SourceError."""
+        """The watched messages, in order, without waiting, until the end or `close`. Raises SourceError."""
         if self._reader is None:
             raise SourceError(f"{self._where} is closed")
         topics = {connection.id: (topic, name) for connection, topic, name in self._connections}
         chosen = [connection for connection, _, _ in self._connections if connection.id in self._decoders]
-        with self._translated():
-            for connection, received_ns, raw in self._reader.messages(chosen, self._first, self._stop):
-                yield RawMessage(*topics[connection.id], received_ns, bytes(raw), self._decoders[connection.id])
+        try:
+            with self._translated():
+                for connection, received_ns, raw in self._reader.messages(chosen, self._first, self._stop):
+                    yield RawMessage(*topics[connection.id], received_ns, bytes(raw), self._decoders[connection.id])
+        except SourceError:
+            if self._reader is not None:  # else it was closed meanwhile, and is over
+                raise
 
     def run(self, emit: Emit, stop: threading.Event) -> None:
         """Replay at the set speed until the end or `stop`. Raises SourceError."""

@@ -78,10 +78,11 @@ class LiveSource(Source):
         self._receiving.start()
         try:
             while not stop.is_set():
+                receiving = self._receiving.is_alive()  # asked first: then nothing comes after a take in vain
                 message = self._backlog.take(TAKE_PATIENCE)
                 if message is not None:
                     emit(message)
-                elif not self._receiving.is_alive():
+                elif not receiving:
                     break
         finally:
             self.close()

@@ -185,6 +185,14 @@ def test_a_malformed_rule_is_refused_at_once():
         Capture([TopicRule("/a", fields=("x..y",))])
 
 
+def test_rules_that_are_refused_leave_the_old_ones_in_force():
+    capture = Capture([TopicRule("/n", fields=("x",))])
+    with pytest.raises(ValueError, match="is not a field path"):
+        capture.take_up([TopicRule("/m"), TopicRule("/n", fields=("x..y",))])
+    assert capture.process(number(1), 0) is not None
+    assert capture.process(number(1, topic="/m"), 0) is None
+
+
 def test_other_rules_leave_what_is_unchanged_as_it_is_and_lose_no_count():
     capture = Capture([TopicRule("/once", once=True), TopicRule("/n"), TopicRule("/b", oversize="refuse", limit=10)])
     for topic in ("/once", "/n"):

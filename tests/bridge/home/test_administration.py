@@ -8,6 +8,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -322,7 +323,7 @@ def test_no_more_readers_than_a_chunk_has_room_for(world: World, tmp_path: Path)
 
 def test_a_robot_with_its_own_keys_is_registered_and_nothing_secret_is_in_its_bundle(world: World) -> None:
     made = world.register()
-    assert made.own_keys and made.funded and made.buried == 0 and world.events == []
+    assert made.own_keys and made.unfunded is None and made.buried == 0 and world.events == []
     data = made.bundle.read_bytes()
     assert not needs_password(data) and b"PRIVATE" not in data
     robot = RobotHome(world.path / "robot-1")
@@ -525,7 +526,57 @@ def test_a_treasury_that_is_empty_registers_and_says_that_there_is_no_eth_yet(
 
     monkeypatch.setattr(world.ledger, "alloc_eth", broke)
     made = world.register()
-    assert not made.funded and made.bundle.exists()
+    assert made.unfunded == "the operator's account has none for it" and made.bundle.exists()
+
+
+def test_a_robot_is_registered_also_where_its_account_gets_no_eth_at_once(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bundle is written by then, and the server gives what is missing."""
+    def down(*_: object) -> None:
+        raise ChainError("the node does not answer")
+
+    monkeypatch.setattr(world.ledger, "alloc_eth", down)
+    made = world.register()
+    assert made.unfunded == "the node does not answer" and made.bundle.exists()
+
+
+def test_an_account_that_has_some_eth_is_given_up_to_what_the_contract_allows(world: World) -> None:
+    world.home.config.write_text(world.home.config.read_text() + "\n[funds]\nby = 5\n")
+    account = world.keys.robot(3).address  # the server is 1, the owner 2
+    operator = world.keys.operator
+    fees = world.ledger.fees(world.ledger.block())
+    [(nonce, _)] = world.ledger.nonces([operator.address])
+    paid = operator.sign_transaction({
+        "chainId": world.ledger.chain_id, "nonce": nonce, "gas": 21_000, "value": 10**16, "to": account,
+        "maxFeePerGas": fees.highest, "maxPriorityFeePerGas": fees.tip or 0, "type": 2,
+    })  # fmt: skip
+    assert world.ledger.send([bytes(paid.raw_transaction)]) == [None]
+    assert world.ledger.balance(account) == 10**16
+    made = world.register()
+    assert made.account == account and made.unfunded is None
+    assert world.ledger.balance(account) == 5 * 10**18
+
+
+def test_a_revocation_of_a_reader_that_was_cut_short_is_done_again(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = ReaderHome(tmp_path / "later")
+    ca = load_ca(world.home.ca, PASSPHRASE, NOW)
+    admin.add_reader(world.home, "later", later, ca=ca, passphrase=PASSPHRASE, now=NOW)
+
+    def crash(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", crash)
+        with pytest.raises(KeyboardInterrupt):
+            world.revoke("later", Role.READER)
+    with suppress(IdentityError):
+        world.revoke("later", Role.READER)
+    assert [path.name for path in world.home.readers.iterdir()] == ["owner.pem"]
+    with pytest.raises(IdentityError, match="'later' was revoked already"):
+        world.revoke("later", Role.READER)
 
 
 def test_an_archive_that_is_named_is_made_and_told_to_readers(tmp_path: Path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -167,11 +167,26 @@ def test_a_request_that_was_altered_is_refused() -> None:
 
 @pytest.mark.parametrize("change", [
     {"end": {}}, {"end": 5}, {"readers": {"../x": "pem"}}, {"certificates": 7}, {"keys": None}, {"readers": [5]},
+    {"readers": {"owner": 5}}, {"certificates": {"sign.crt.pem": 5}}, {"keys": {"sign.key.pem": None}},
+    {"end": asdict(END) | {"genesis": "0x1"}}, {"end": asdict(END) | {"chain_id": "one"}},
+    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"server_address": None}},
 ])
 def test_a_bundle_that_was_damaged_is_refused(change: dict[str, object]) -> None:
     bundle = answer(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))))
     with pytest.raises(IdentityError):
         read_bundle(json.dumps(json.loads(bundle.encode()) | change).encode())
+
+
+@pytest.mark.parametrize("part", ["certificates", "keys"])
+@pytest.mark.parametrize("name", ["../../.profile", "/tmp/rosbridge-eth-planted", "note.txt"])
+def test_a_bundle_writes_no_file_but_an_identitys(home: RobotHome, tmp_path: Path, part: str, name: str) -> None:
+    """Who could change a bundle on its way is found out by the fingerprint, after the files are written."""
+    head = json.loads(answer(ask_to_join(home, "robot_1", b"robot's")).encode())
+    head[part][name] = "planted"
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(IdentityError, match="damaged"):
+        join(home, read_bundle(json.dumps(head).encode()))
+    assert sorted(tmp_path.rglob("*")) == before and not Path(name).exists()
 
 
 def test_a_crash_while_joining_is_mended_by_joining_again(home: RobotHome, monkeypatch: pytest.MonkeyPatch) -> None:

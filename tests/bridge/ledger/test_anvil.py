@@ -203,6 +203,31 @@ def test_a_kill_costs_what_was_not_saved_and_never_the_chain(tmp_path: Path, mon
     assert list(tmp_path.glob(".chain*")) == []
 
 
+def test_a_disk_that_takes_nothing_is_said_and_the_chain_is_saved_when_it_does_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(nodes, "SAVE_SECONDS", 0.05)
+    monkeypatch.setattr(nodes, "SAVE_SHARE", 0)
+    (folder := tmp_path / "disk").mkdir()
+    running = start(free_port(), state=folder / "chain")
+    folder.rename(tmp_path / "away")
+    running.ask("anvil_mine", "0x1")
+    deadline = time.monotonic() + 30
+    while "the chain's state is not saved" not in caplog.text:
+        assert time.monotonic() < deadline, "nobody is told"
+        time.sleep(0.02)
+    (tmp_path / "away").rename(folder)
+    before = (folder / "chain").stat().st_ino
+    while (folder / "chain").stat().st_ino == before:
+        assert time.monotonic() < deadline, "nothing is saved any more"
+        time.sleep(0.02)
+    running.ask("anvil_mine", "0x1")
+    folder.rename(tmp_path / "away")
+    with pytest.raises(ChainError, match="cannot be written"):
+        running.stop()
+    assert not running.running()
+
+
 def test_the_size_is_known_and_a_large_one_is_told(tmp_path: Path, monkeypatch, caplog: pytest.LogCaptureFixture):
     monkeypatch.setattr(nodes, "TOLD_FROM", 1000)
     with start(free_port(), state=tmp_path / "chain") as running:

@@ -16,7 +16,7 @@ from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import Ledger, RegistrationEvent
 from rosbridge_eth.ledger.contract import NOTHING, Standing, artifact, set_data_cost, set_data_gas
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
+from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted, Underpriced
 
 OPERATOR, ROBOT, OTHER = KEYS.operator, KEYS.robot(1), KEYS.robot(2)
 TK, OTHER_TK = robot_id("robot_1"), robot_id("robot_2")
@@ -307,6 +307,13 @@ def test_a_transaction_that_another_one_overtakes_is_sent_with_the_next_nonce(ma
     answers = iter([stale])
     made.nonces = lambda accounts: next(answers, None) or real(accounts)  # type: ignore[method-assign]
     assert made.transact(OPERATOR, "offerOperator", ROBOT.address).succeeded
+
+
+def test_a_transaction_that_the_node_does_not_take_is_not_said_to_be_taken(made: Ledger, monkeypatch):
+    """As where a node wants a higher tip than it names."""
+    monkeypatch.setattr(made, "send", lambda raws: [Underpriced("transaction underpriced") for _ in raws])
+    with pytest.raises(Underpriced, match="transaction underpriced"):
+        made.transact(OPERATOR, "offerOperator", ROBOT.address, wait=0.1)
 
 
 def test_every_function_event_and_error_is_on_the_page():

@@ -456,6 +456,23 @@ def test_a_robot_that_may_not_write_is_on_hold_and_others_go_on(tmp_path: Path):
     assert world.hold(revoked) is None
 
 
+def test_what_a_robot_had_in_flight_when_it_was_revoked_takes_no_room_from_others(tmp_path: Path):
+    world = World(tmp_path, robots=2)
+    revoked, fine = world.pens
+    world.take(revoked.chunks(120, 8_000), revoked)
+    world.turn()
+    assert world.submitter.in_flight == IN_FLIGHT
+    standings = world.model.state.standings
+    standings[revoked.tk] = standings[revoked.tk]._replace(revoked=True)
+    world.model.drop()
+    world.take(fine.chunks(100, 8_000), fine)
+    for _ in range(10):
+        world.turn(mine=1)
+    world.turn()
+    assert world.on_chain(fine) == fine.digests
+    assert world.submitter.in_flight == 0
+
+
 def test_a_refusal_costs_one_transaction_and_then_nothing(world: World):
     """The contract refuses what the submitter has no other way to foresee."""
     world.take(world.pen.chunks(3))
@@ -511,6 +528,30 @@ def test_an_empty_treasury_is_said_and_nothing_is_dropped(tmp_path: Path):
     world.model.state.balances[OPERATOR] = ETH
     world.run()
     assert world.submitter.funds is None
+
+
+def test_what_is_said_of_the_treasury_ends_with_the_work_that_needed_it(tmp_path: Path):
+    world = World(tmp_path, wei=ETH // 100)
+    world.model.state.balances[OPERATOR] = 0
+    world.take(world.pen.chunks(1))
+    world.turn()
+    assert "is empty" in str(world.submitter.funds)
+    world.run()
+    world.model.state.balances[OPERATOR] = ETH
+    world.turn()
+    assert world.submitter.funds is None
+
+
+def test_a_batch_above_the_gas_of_a_day_is_paid_by_several_days(tmp_path: Path):
+    world = World(tmp_path, gas_per_day=1_000_000)
+    world.take(world.pen.chunks(12, 8_000))
+    for _ in range(3 * 24):
+        world.turn(3600, mine=1)
+    assert world.on_chain() == world.pen.digests, "about 4 million gas: one day's, and the next three are spent"
+    world.take(world.pen.chunks(1, 8_000))
+    for _ in range(2):
+        world.turn(3600, mine=1)
+    assert len(world.on_chain()) == 12 and "gas_per_day" in str(world.hold())
 
 
 def test_a_robot_spends_at_most_its_gas_of_a_day(tmp_path: Path):

@@ -211,6 +211,33 @@ def test_links_that_lead_nowhere_end():
     assert len(node.asked) == 1
 
 
+def test_a_link_that_does_not_lead_back_is_not_followed():
+    """The batch of block 7 says that the one before it is in block 7 as well."""
+    with HostileNode(says(eth_getLogs=[])) as node:
+        topic = ledger(node)._contract.events.Data().topic
+
+    def log(first: int, block: int, previous: int) -> dict[str, Any]:
+        return {
+            "address": CONTRACT, "blockNumber": hex(block), "logIndex": "0x0", "transactionHash": HASH,
+            "blockHash": HASH, "transactionIndex": "0x0", "removed": False,
+            "data": f"0x{previous:064x}{64:064x}{0:064x}",
+            "topics": [topic, "0x" + TK.hex(), f"0x{first:064x}", "0x" + "00" * 32],
+        }  # fmt: skip
+
+    logs = [log(2, 9, 8), log(1, 8, 7), log(0, 7, 7)]
+
+    def answer(connection: socket.socket, body: Any) -> None:
+        start, end = (int(body["params"][0][key], 16) for key in ("fromBlock", "toBlock"))
+        found = [each for each in logs if start <= int(each["blockNumber"], 16) <= end]
+        connection.sendall(http(json.dumps({"jsonrpc": "2.0", "id": body["id"], "result": found}).encode()))
+
+    read = []
+    with HostileNode(answer) as node, pytest.raises(ChainError, match="which is not before it"):
+        for event in ledger(node).newest_data(TK, 9):
+            read.append(event.first)
+    assert read == [2, 1, 0]
+
+
 def test_ranges_are_halved_where_they_are_refused_and_doubled_again():
     asked = []
 

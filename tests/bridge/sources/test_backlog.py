@@ -25,6 +25,35 @@ def drain(backlog: Backlog) -> list[tuple[str, int]]:
     return found
 
 
+def test_what_came_just_before_the_end_is_not_left_behind(monkeypatch):
+    """The message comes, and the receiving thread ends, after the emitting one found nothing."""
+
+    class Late(LiveSource):
+        kind = "late"
+
+        def offers(self):
+            return ()
+
+        def _receive(self):
+            waited.wait(5)
+            self._backlog.put(message("/a", 1))
+
+    waited, emitted = threading.Event(), []
+    source = Late(Selection(["/a"]), None, 10, 10_000)
+    take = source._backlog.take
+
+    def nothing_yet(timeout):
+        if waited.is_set():
+            return take(timeout)
+        waited.set()
+        source._receiving.join()
+        return None
+
+    monkeypatch.setattr(source._backlog, "take", nothing_yet)
+    source.run(emitted.append, threading.Event())
+    assert [each.received_ns for each in emitted] == [1]
+
+
 def test_order_is_that_of_arrival_across_topics():
     backlog = Backlog()
     sent = [(f"/{number % 3}", number) for number in range(100)]

@@ -187,6 +187,19 @@ def test_what_a_bag_offers(bag):
         next(source.messages())
 
 
+def test_a_bag_that_is_closed_while_it_is_replayed_ends(bag):
+    """As a robot does it that is stopped: another thread closes the source while this one reads on."""
+    source = BagSource(bag, Selection(["**"]), speed=MAX_SPEED)
+    emitted: list[RawMessage] = []
+
+    def emit(message: RawMessage) -> None:
+        emitted.append(message)
+        source.close()
+
+    source.run(emit, threading.Event())
+    assert 1 <= len(emitted) <= 10
+
+
 def test_a_node_means_what_it_publishes(tmp_path):
     path = tmp_path / "some.bag"
     write_ros1(path)

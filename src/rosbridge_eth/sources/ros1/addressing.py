@@ -15,6 +15,7 @@ import os
 import re
 import socket
 from collections.abc import Mapping
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 from rosbridge_eth.config import Address
@@ -77,13 +78,11 @@ def own_host(configured: str | None, master: Address, environment: Mapping[str, 
         if not _HOST.fullmatch(text):
             raise SourceError(f"{text!r} (`hostname` of [source], ROS_HOSTNAME or ROS_IP) is not a name or address")
         return text
-    try:
+    with suppress(OSError, UnicodeError):  # a name that can be none, such as a..b, is UnicodeError
         for family, kind, protocol, _, address in socket.getaddrinfo(*master, type=socket.SOCK_DGRAM):
-            with socket.socket(family, kind, protocol) as probe:
+            with suppress(OSError), socket.socket(family, kind, protocol) as probe:
                 probe.connect(address)  # sends nothing: it only has the kernel choose our address
                 return str(probe.getsockname()[0])
-    except OSError:
-        return None
     return None
 
 

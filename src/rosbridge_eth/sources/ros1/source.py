@@ -101,6 +101,10 @@ class Ros1Source(LiveSource):
         except OSError as error:
             raise SourceError(f"the ROS master at {self._master} does not answer: {api.why(error)}") from None
 
+    def watch(self, selection: Selection) -> None:
+        super().watch(selection)
+        self._looked = False
+
     def close(self) -> None:
         """End within STOP_PATIENCE; the master is told."""
         self._ending.set()

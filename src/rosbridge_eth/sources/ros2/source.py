@@ -79,7 +79,7 @@ class Ros2Source(live.LiveSource):
         self._depth = depth
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._unusable: set[tuple[str, str]] = set()
-        self._look_now = False
+        self._look_now, self._complain_at = False, float("inf")
         self._rclpy = parts.import_rclpy()
         self._context = self._rclpy.Context()
         try:
@@ -102,6 +102,10 @@ class Ros2Source(live.LiveSource):
         """The topics that somebody publishes now, without hidden ones. Discovery takes a second or two."""
         return self._read_graph()[0]
 
+    def watch(self, selection: Selection) -> None:
+        super().watch(selection)
+        self._complain_at = self._now() + UNMATCHED_AFTER
+
     def close(self) -> None:
         """Leave the graph."""
         self._ending.set()
@@ -121,15 +125,15 @@ class Ros2Source(live.LiveSource):
     def _receive(self) -> None:
         try:
             due = self._now()
-            complain_at = due + UNMATCHED_AFTER
+            self._complain_at = due + UNMATCHED_AFTER
             while not self._ending.is_set():
                 now = self._now()
                 if now >= due or self._look_now:
                     self._look(now)
                     due = now + LOOK_EVERY
-                if now >= complain_at:
+                if now >= self._complain_at:
                     self._tell_unmatched()
-                    complain_at = float("inf")
+                    self._complain_at = float("inf")
                 self._executor.spin_once(timeout_sec=max(due - now, 0.0))
         except RuntimeError as error:
             raise SourceError(f"the ROS 2 graph was lost: {parts.first_line(error)}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 
 import pytest
 from hypothesis import given
@@ -61,6 +62,23 @@ def test_ros_hostname_precedes_ros_ip(configured, environment, expected):
 
 def test_a_master_that_cannot_be_found_leaves_our_own_address_open():
     assert own_host(None, Address("no-such-host.invalid", 11311), {}) is None
+
+
+def test_a_name_that_can_be_none_is_one_that_does_not_resolve():
+    assert own_host(None, Address("robot..lan", 11311), {}) is None
+    assert own_host(None, Address("r" * 64, 11311), {}) is None
+
+
+def test_of_a_masters_addresses_one_without_a_route_is_passed_over(monkeypatch):
+    hosts = ["255.255.255.255", "127.0.0.1"]  # the first is for those who ask to broadcast
+
+    def resolved(_host, port, **_):
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", (host, port)) for host in hosts]
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolved)
+    assert own_host(None, Address("master", 11311), {}) == "127.0.0.1"
+    hosts.pop()
+    assert own_host(None, Address("master", 11311), {}) is None
 
 
 def test_we_listen_where_we_say():

@@ -108,6 +108,21 @@ def test_a_pattern_is_registered_when_it_matches_and_left_when_it_does_not(make,
     assert script.subject._topics == {}
 
 
+def test_a_name_that_nobody_publishes_is_said_after_every_change_of_the_topics(make, caplog):
+    script = make("/a")
+    script.turn()
+    script.turn()
+    script.subject.watch(Selection(["/a", "/b"]))
+    script.turn()
+    script.turn()
+    assert [record.message for record in caplog.records if "/a" in record.message] == [
+        "nothing of the name /a is published yet; waiting for it"
+    ]
+    assert [record.message for record in caplog.records if "/b" in record.message] == [
+        "nothing of the name /b is published yet; waiting for it"
+    ]
+
+
 def test_the_doorbell_has_the_master_asked_and_nothing_believed(make, begun):
     script = make("/a")
     script.publishers = {"/a": ["http://x:1/"]}
