@@ -60,7 +60,7 @@ class Cache:
     """
 
     def __init__(self, path: Path, key: bytes) -> None:
-        self._path, self._key, self._gcm = path, key, sm4.SM4GCM(key)
+        self._path, self._gcm = path, sm4.SM4GCM(key)
         self.progress, self.links = Progress(), Links()
         self.block, self.hash, self.next_block = 0, b"", 0
         self._keeping, self._linked = True, 0
@@ -96,12 +96,6 @@ class Cache:
 
     def close(self) -> None:
         self._db.close()
-
-    def emptied(self) -> Cache:
-        """The file begun anew, in place of this object."""
-        self.close()
-        self._path.unlink()
-        return Cache(self._path, self._key)
 
     def _begin_segment(self) -> None:
         self._places: list[Place] = []
@@ -200,11 +194,12 @@ class Cache:
 
 
 def open_cache(
-    folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust: Trust, granted: Mapping[bytes, bytes]
-) -> Cache | None:
+    folder: Path, name: str, log_: Log, reader: sm2.PrivateKey, trust: Trust, granted: Mapping[bytes, bytes], *,
+    anew: bool = False,
+) -> Cache | None:  # fmt: skip
     """What this reader has proven of the robot on this ledger under these CAs; None where nothing can be kept.
 
-    granted: keys that were handed over; with others, the file is begun anew.
+    granted: keys that were handed over; with others, the file is begun anew. anew: so it is whatever it holds.
     """
     roots = sm3.digest(b"".join(root.to_der() for root in trust.roots))
     given = b"".join(digest + key for digest, key in sorted(granted.items()))
@@ -213,12 +208,14 @@ def open_cache(
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         try:
-            return Cache(path, key)
-        except (sqlite3.DatabaseError, StoreError) as error:
-            if isinstance(error, sqlite3.OperationalError):
-                raise
-            path.unlink()
-            return Cache(path, key)
+            if not anew:
+                return Cache(path, key)
+        except sqlite3.OperationalError:
+            raise
+        except (sqlite3.DatabaseError, StoreError, ValueError):  # damaged, of another key or of another version
+            pass
+        path.unlink()
+        return Cache(path, key)
     except (sqlite3.Error, OSError) as error:
         log.warning("%s: what is read is not kept: %s", path, error)
         return None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,11 +97,11 @@ def read_robot(
         mark = replace(mark, count=0)  # it is above the block that is asked for, and not taken back
     registrations = ledger.registrations(tk, standing)
     at, links, next_block, kept = Progress(), Links(), 0, None
-    if before is not None and before.verifier.honest and _still_there(ledger, before.top, block):
+    if before is not None and before.verifier.honest and _is_there(ledger, before.top.number, before.top.hash, block):
         at, links, next_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
     elif cache is not None and reader is not None:
         file = f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}"
-        kept = _kept(cache, file, log, reader, trust, granted or {}, ledger, block, told)
+        kept = _kept(partial(open_cache, cache, file, log, reader, trust, granted or {}), ledger, block, told)
         if kept is not None:
             at, links, next_block = kept.progress, kept.links, kept.next_block
     verifier = Verifier(
@@ -114,46 +115,48 @@ def read_robot(
     if kept is None:
         chunks = verifier.read(events)
     else:
-        chunks = _keeping(kept, verifier, events, ledger.block(max(0, block - MARGIN)))
+        chunks = _keeping(kept, verifier, events, standing.chunks, ledger.block(max(0, block - MARGIN)))
     return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, trust, bodies, kept)
 
 
-def _still_there(ledger: Ledger, seen: Block, block: int) -> bool:
-    return seen.number <= block and ledger.block(seen.number).hash == seen.hash
+def _is_there(ledger: Ledger, number: int, hash_: bytes, block: int) -> bool:
+    """Whether the chain up to `block` has this one, and so all that came before it."""
+    return number <= block and ledger.block(number).hash == hash_
 
 
-def _kept(
-    folder: Path, name: str, log: Log, reader: sm2.PrivateKey, trust: Trust, granted: Mapping[bytes, bytes],
-    ledger: Ledger, block: int, told: list[str],
-) -> Cache | None:
+def _kept(opened: Callable[..., Cache | None], ledger: Ledger, block: int, told: list[str]) -> Cache | None:
     """What earlier readings have proven, if the chain up to there is the same; empty if it is another one."""
-    kept = open_cache(folder, name, log, reader, trust, granted)
-    if kept is None or kept.block == 0 or (kept.block <= block and ledger.block(kept.block).hash == kept.hash):
+    kept = opened()
+    if kept is None or kept.block == 0 or _is_there(ledger, kept.block, kept.hash, block):
         return kept
+    kept.close()
     if kept.block <= block:
         told.append(f"the chain has another block {kept.block} than at the reading before: all of it was read anew")
-        return kept.emptied()
+        return opened(anew=True)
     told.append(f"what was read before reaches block {kept.block}, above block {block}: it was not used")
-    kept.close()
     return None
 
 
-def _keeping(kept: Cache, verifier: Verifier, events: Iterator[DataEvent], final: Block) -> Iterator[ProvenChunk]:
-    """The chunks of the events; what is in final blocks is kept as it is proven, unless the node is not honest."""
+def _keeping(
+    kept: Cache, verifier: Verifier, events: Iterator[DataEvent], chunks: int, final: Block
+) -> Iterator[ProvenChunk]:
+    """The chunks of the events, `chunks` in all; what is in final blocks is kept, unless the node is not honest."""
 
-    def commit(next_block: int) -> None:
-        if verifier.keeps and final.number > 0:
-            kept.commit(verifier.progress(), next_block, final.number, final.hash)
+    def commit(next_block: int, until: int = 0) -> None:
+        """until: the chunks that were read, if none was withheld before `next_block`."""
+        progress = verifier.progress()
+        if verifier.keeps and progress.count >= until and final.number > 0:
+            kept.commit(progress, next_block, final.number, final.hash)
 
     def finals() -> Iterator[DataEvent]:
         for event in events:
             if event.block > final.number:
-                commit(final.number + 1)
+                commit(final.number + 1, event.first)
                 yield event
                 break
             yield event
         else:
-            commit(final.number + 1)
+            commit(final.number + 1, chunks)
         yield from events
 
     for chunk in verifier.read(finals()):

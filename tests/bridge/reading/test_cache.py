@@ -220,6 +220,19 @@ def test_what_a_node_kept_back_is_asked_for_again(chain, tmp_path):
     assert numbers(read(chain, tmp_path)[0]) == list(range(40))
 
 
+@pytest.mark.parametrize("gone", [5, 9])
+def test_what_a_node_kept_back_at_the_end_of_what_is_final_is_asked_for_again(chain, tmp_path, gone, monkeypatch):
+    """gone: the last batch of the final ones, and the very last."""
+    chain.head = chain.data[gone].block + MARGIN
+    withholding = Chain(chain.data, chain.head)
+    shown = [event for event in chain.data if event is not chain.data[gone]]
+    monkeypatch.setattr(withholding, "data_events", lambda tk, first, last: iter(shown))
+    assert read(withholding, tmp_path)[1].verdict().counts["withheld"] == 2
+    found, reading = read(chain, tmp_path)
+    assert numbers(found) == list(range(40))
+    assert reading.verdict().sound
+
+
 # --- the file
 
 
@@ -273,6 +286,29 @@ def test_rows_that_changed_places_are_not_believed(chain, tmp_path):
         db.executemany("UPDATE row SET sealed = ? WHERE kind = 2 AND id = ?", [(b, one), (a, two)])
     with pytest.raises(StoreError, match="damaged"):
         read(chain, tmp_path)
+
+
+def test_a_file_of_another_version_is_begun_anew(chain, tmp_path):
+    read(chain, tmp_path)
+    trust = Trust([authority().certificate])
+    [path] = (tmp_path / "proven").iterdir()
+    kept = caching.open_cache(path.parent, path.stem, LOG, reader().encryption_key, trust, {})
+    assert kept is not None and kept.progress.count > 0
+    kept._put(caching._STATE, 0, b'[13, "", 14]\n{"count": "as it was counted then"}')
+    kept.close()
+    assert numbers(read(chain, tmp_path)[0]) == list(range(40))
+
+
+def test_a_file_that_cannot_be_begun_anew_costs_only_the_keeping(chain, tmp_path, caplog, monkeypatch):
+    read(chain, tmp_path)
+    chain.fork = 13
+
+    def unlink(self: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(caching.Path, "unlink", unlink)
+    assert numbers(read(chain, tmp_path)[0]) == list(range(40))
+    assert "is not kept" in caplog.text
 
 
 def test_two_at_once_both_read(chain, tmp_path, caplog):
