@@ -36,6 +36,7 @@ _BEFORE_LONDON: Final = 15
 #: Bytes of a node, 17 hashes and their RLP. What is larger is a leaf.
 _LARGEST_BRANCH: Final = 3 + 17 * 33
 _ROBOTS, _BATCH = 2, 4  # slots of RobotLedger.sol
+_SLOTS = 500  # asked for at once; geth proves 1,024, Erigon 1,000
 _OTHERWISE = "an event of the contract is not as Solidity writes it"
 _DATA = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
 _REGISTERED = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
@@ -329,12 +330,12 @@ def prove_state(ledger: Ledger, header: Header, slots: Sequence[int]) -> Nodes:
     """The nodes from the state's root to these slots of the contract. ChainError where the node does not give them."""
 
     def form(answers: Sequence[Any]) -> Nodes:
-        [answer] = answers
-        proofs = [answer["accountProof"], *(one["proof"] for one in answer["storageProof"])]
-        return Nodes(_bytes(node) for proof in proofs for node in proof)
+        proofs = [[answer["accountProof"], *(one["proof"] for one in answer["storageProof"])] for answer in answers]
+        return Nodes(_bytes(node) for answer in proofs for proof in answer for node in proof)
 
     wanted = ["0x" + slot.to_bytes(32, "big").hex() for slot in slots]
-    return ledger.ask([("eth_getProof", [ledger.contract, wanted, hex(header.number)])], form)
+    pages = [wanted[at : at + _SLOTS] for at in range(0, len(wanted), _SLOTS)]
+    return ledger.ask([("eth_getProof", [ledger.contract, page, hex(header.number)]) for page in pages], form)
 
 
 def _receipt(receipt: Mapping[str, Any]) -> bytes:

@@ -112,8 +112,15 @@ def printable(text: object, limit: int = 300) -> str:
 def shown(url: str) -> str:
     """A node's address as people see it: without password and path, which may hold an access key."""
     parts = urlsplit(url)
-    port = f":{parts.port}" if parts.port else ""
-    return f"{parts.scheme}://{parts.hostname}{port}"
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}"
+
+
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # brackets that do not close, a port beyond 65,535
+        return False
 
 
 # ---------------------------------------------------------------------- deadline and limit
@@ -217,11 +224,7 @@ class Node:
         limit_recursion()
         self._abi, self._session, self.url = abi, None, "embedded"
         if isinstance(where, str):
-            try:
-                usable = re.match("https?://[^/]", where) is not None and urlsplit(where).port != 0
-            except ValueError:  # a port above 65535, or half an IPv6 address
-                usable = False
-            if not usable:
+            if not _is_url(where):
                 raise ConfigError('this is no URL of a node: write "http://127.0.0.1:8545" or "https://..."')
             self.url, self._session = shown(where), session()
             options = {"timeout": timeout, "allow_redirects": False}
@@ -242,7 +245,7 @@ class Node:
                 got: Any = self.w3.provider.make_batch_request(page)  # type: ignore[attr-defined]
                 if not isinstance(got, list) or len(got) != len(page):
                     raise self._error(got.get("error", "no batches") if isinstance(got, dict) else "a wrong count")
-                answers += [self._error(answer["error"]) if "error" in answer else answer["result"] for answer in got]
+                answers += [self._error(answer["error"]) if answer.get("error") else answer["result"] for answer in got]
         return answers
 
     @contextmanager

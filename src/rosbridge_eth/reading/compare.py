@@ -127,6 +127,8 @@ def _message_of(record: MessageLine, waiting: Sequence[RawMessage]) -> tuple[int
 
 def _wrong(value: Any, message: Any, path: str) -> str | None:
     """The first place where captured JSON is not what the ROS message says; None if there is none."""
+    if isinstance(message, numpy.generic):  # an array's element; of float32, infinity is no float of Python's
+        message = message.item()
     if isinstance(value, dict) and value.keys() == {"sm3", "length"} and not hasattr(message, "sm3"):
         content = message.encode() if isinstance(message, str) else numpy.asarray(message).tobytes()
         right = {"sm3": sm3.digest(content).hex(), "length": len(content)}

@@ -465,7 +465,7 @@ const evidence = (() => {
       encoded: header, digest: hex(sm3(header)), stream: hex(field(2, 16)), number: String(big(field(18, 8))),
       sealed: small(field(58, 8), 'when a chunk was sealed'), records: small(field(66, 4)), root: field(70, 32),
       r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0,
-      longest: data[1] & 2 ? 2 ** 24 - 2 ** 17 : 60 * 1024, // bytes of a line
+      archived: (data[1] & 2) !== 0, longest: data[1] & 2 ? 2 ** 24 - 2 ** 17 : 60 * 1024, // bytes of a line
     }
   }
 
@@ -639,7 +639,7 @@ const evidence = (() => {
       const governing = signers.findLast((one) => one.first <= at)
       need(governing?.key, `no certificate governs it: ${governing?.why ?? 'none is registered'}`)
       const form = (purpose) => join(utf8.encode(`rosbridge-eth/2 ${purpose}\0`), log, chunk.encoded)
-      const forms = chunk.bare ? ['dropped', 'chunk'] : ['chunk']
+      const forms = [...(chunk.bare ? ['dropped'] : []), ...(chunk.bare && !chunk.archived ? [] : ['chunk'])]
       need(forms.some((one) => signed(governing.key, form(one), chunk.r, chunk.s)), 'the robot did not sign its chunk')
       need(chunk.sealed <= governing.until, "its chunk was sealed after the end of the robot's certificate")
       return { ...chunk, block: found.block }

@@ -30,7 +30,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.chunk import Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id
 from rosbridge_eth.config.values import time_text
-from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
+from rosbridge_eth.errors import ChainError, ConfigError, StoreError, VerificationError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import proofs as chain
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
@@ -438,8 +438,9 @@ def _proven(reading: Reading, records: Sequence[ProvenRecord], data: Iterable[Da
             if index in numbers:
                 chunk = Chunk.parse(encoded)
                 if chunk.bare and reading.bodies is not None:
-                    body = reading.bodies(chunk.header.body_digest, chunk.header.body_length)
-                    chunk = replace(chunk, body=body or b"")
+                    chunk = replace(chunk, body=reading.bodies(chunk.header.body_digest, chunk.header.body_length) or b"")
+                    if sm3.digest(chunk.body) != chunk.header.body_digest:
+                        raise StoreError(f"the archive does not have the body of {chunk.header} any more")
                 key = reading.verifier.key_of(chunk.header)
                 lines = open_lines(reading.verifier.log, chunk, key)
                 for one in proofs(lines, key, sorted(numbers[index])):

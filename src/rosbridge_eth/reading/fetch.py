@@ -62,10 +62,8 @@ class Reading:
 
     def keep(self, bookmarks: Bookmarks, *, confirm: bool = False) -> None:
         """Write the bookmark. confirm: the reader has compared the fingerprints of new certificates."""
-        bookmark, known = self.verifier.bookmark(confirm=confirm), bookmarks.get(self.verifier.log)
-        if bookmark is not None and known is not None and known.count > bookmark.count:
-            bookmark = replace(known, fingerprints=bookmark.fingerprints)
-        if bookmark is not None and bookmark != known:
+        bookmark = self.verifier.bookmark(confirm=confirm)
+        if bookmark is not None:
             bookmarks.put(self.verifier.log, bookmark)
 
 

@@ -23,11 +23,16 @@ source.onerror = () => {
 
 function show() {
   showChain();
+  for (const [name, article] of robots) { // the reader was begun anew, with other robots
+    if (state.robots.some((robot) => robot.name === name)) continue;
+    article.remove();
+    robots.delete(name);
+  }
   for (const robot of state.robots) {
     if (!robots.has(robot.name)) {
       const article = $("#robot").content.cloneNode(true).firstElementChild;
       const heading = $("h2", article);
-      heading.id = `robot-${robots.size}`;
+      heading.id = `robot-${robot.name}`;
       article.setAttribute("aria-labelledby", heading.id);
       $(".name", article).textContent = robot.name;
       $("#robots").append(article);
@@ -98,6 +103,7 @@ function facts(list, pairs) {
 
 function showLatest(section, topics) {
   const there = new Map([...section.querySelectorAll("details")].map((one) => [one.dataset.topic, one]));
+  for (const [name, details] of there) if (!topics.some((topic) => topic.topic === name)) details.remove();
   for (const topic of topics) {
     let details = there.get(topic.topic);
     if (!details) {
@@ -155,13 +161,13 @@ function draw(svg, robot) {
     const x = X(n * step);
     if (x < 0 || x > width) continue;
     parts.push(shape("line", { class: n ? "grid" : "axis", x1: x, x2: x, y1: 0, y2: height }));
-    if (x > 40 && x < width - 64) labels.push(shape("text", { x, y: height - 6, "text-anchor": "middle" }, short(n * step)));
+    if (x > 40 && x < width - 64) labels.push(shape("text", { x, y: height - 6, "text-anchor": "middle" }, short(n * step, 12)));
   }
   for (let n = Math.ceil((low - height / scale) / step); n * step <= high + height / scale; n++) {
     const y = Y(n * step);
     if (y < 0 || y > height) continue;
     parts.push(shape("line", { class: n ? "grid" : "axis", x1: 0, x2: width, y1: y, y2: y }));
-    if (y > 20 && y < height - 26) labels.push(shape("text", { x: 6, y: y - 4 }, short(n * step)));
+    if (y > 20 && y < height - 26) labels.push(shape("text", { x: 6, y: y - 4 }, short(n * step, 12)));
   }
   labels.push(shape("text", { x: width - 6, y: height - 6, "text-anchor": "end" }, "x in m"));
   labels.push(shape("text", { x: 6, y: 14 }, "y in m"));
@@ -232,7 +238,7 @@ function nice(least) { // 1, 2 or 5 times a power of ten
   return power * [1, 2, 5, 10].find((times) => times * power >= least);
 }
 
-const short = (number) => String(Number(number.toPrecision(4)));
+const short = (number, digits = 4) => String(Number(number.toPrecision(digits)));
 const clock = (ms) => new Date(ms).toISOString().slice(0, 19).replace("T", " ") + "Z";
 
 function ago(ms) {

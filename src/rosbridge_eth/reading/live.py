@@ -114,7 +114,7 @@ def _tracks(trajectory: Trajectory) -> list[dict[str, Any]]:
     return [
         {"topic": shown(topic, MAX_TOPIC), "count": track.count,
          "from_ns": str(track.kept[0][0]), "to_ns": str(track.last[0]),
-         "points": [[float(f"{x:.7g}"), float(f"{y:.7g}")] for _, x, y in (*track.kept, track.last)]}
+         "points": [[float(f"{x:.10g}"), float(f"{y:.10g}")] for _, x, y in (*track.kept, track.last)]}
         for topic, track in trajectory.tracks.items()
     ]  # fmt: skip
 
@@ -142,7 +142,7 @@ class Page:
     def __init__(self, address: Address, view: View) -> None:
         files = resources.files(__package__)
         handler = type("_View", (_Handler,), {
-            "view": view, "names": OWN_NAMES | {address.host}, "room": threading.BoundedSemaphore(MAX_PAGES),
+            "view": view, "names": OWN_NAMES | {address.host.lower()}, "room": threading.BoundedSemaphore(MAX_PAGES),
             "files": {path: (files.joinpath(name).read_bytes(), kind) for path, (name, kind) in _FILES.items()},
         })  # fmt: skip
         family = socket.AF_INET6 if ":" in address.host else socket.AF_INET

@@ -23,7 +23,7 @@ import os
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -120,7 +120,10 @@ _FIXED: Final = {
     "topic": "text", "type": "text", "source": "text", "received_ns": "time", "captured_ns": "time", "clock": "bool",
     "stream": "text", "number": "int", "chunk": "int", "record": "int", "block": "int", "transaction": "text",
 }  # fmt: skip
-"""Columns of every table; after them those of the messages' fields, a dot between the levels."""
+"""Columns of every table; after them those of the messages' fields, a dot between the levels.
+
+One that has the name of a column here begins with a dot.
+"""
 
 
 class Table:
@@ -157,6 +160,10 @@ class Table:
             *fixed, cells = json.loads(row)
             yield [*fixed, *(cells.get(column) for column in self._columns)]
 
+    def _names(self, fixed: Collection[str]) -> Iterator[str]:
+        yield from fixed
+        yield from (f".{column}" if column in fixed else column for column in self._columns)
+
     def flush(self) -> None:
         if self._grows is not None:
             self.write_csv(self._grows)
@@ -167,7 +174,7 @@ class Table:
         with path.open("w" if anew else "a", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             if anew:
-                writer.writerow([_cell(column) for column in (*_FIXED, *self._columns)])
+                writer.writerow([_cell(column) for column in self._names(_FIXED)])
             writer.writerows(map(_cell, row) for row in self._read(0 if anew else self._flushed))
         self._flushed, self._header = self._rows.seek(0, 2), len(self._columns)
 
@@ -175,7 +182,7 @@ class Table:
         pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
         kinds = [{kind} for kind in _FIXED.values()] + list(self._columns.values())
         types, values = zip(*(_arrow(pyarrow, found - {""}) for found in kinds), strict=True)
-        names = [column.removesuffix("_ns") for column in _FIXED] + list(map(printable, self._columns))
+        names = [printable(column) for column in self._names([column.removesuffix("_ns") for column in _FIXED])]
         schema, rows = pyarrow.schema(zip(names, types, strict=True)), self._read()
         with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
             while batch := list(islice(rows, _BATCH)):

@@ -6,6 +6,8 @@ worth knowing, and no breach. Whatever of a log is shown goes through `shown`.
 
 from __future__ import annotations
 
+import fcntl
+import os
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -194,8 +196,19 @@ class Bookmarks:
         return self._logs().get(_key(log))
 
     def put(self, log: Log, bookmark: Bookmark) -> None:
-        file = _File(logs=self._logs() | {_key(log): bookmark})
-        write_atomically(self._path, file.model_dump_json(indent=1).encode() + b"\n")
+        """Move it. Where another command has moved it further it stays there, with these fingerprints."""
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)  # what another command puts meanwhile is not written over
+            logs = self._logs()
+            known = logs.get(_key(log))
+            if known is not None and known.count > bookmark.count:
+                bookmark = replace(known, fingerprints=bookmark.fingerprints)
+            if bookmark != known:
+                file = _File(logs=logs | {_key(log): bookmark})
+                write_atomically(self._path, file.model_dump_json(indent=1).encode() + b"\n")
+        finally:
+            os.close(folder)
 
     def other_ledgers(self, log: Log) -> list[bytes]:
         """Ids of the other ledgers on which this reader has read the same robot."""
@@ -282,7 +295,7 @@ class Verdict:
         yield f"  {self.records:,} record{'' if self.records == 1 else 's'} proven{counts}"
         yield from (f"  certificate {certificate}" for certificate in self.certificates)
         yield from (f"  {finding}" for finding in self.findings)
-        if len(self.findings) >= MAX_FINDINGS // 2:
+        if sum(one.count for one in self.findings) < sum(self.counts.values()):
             yield f"  only the first {len(self.findings)} findings are listed; the counts above are whole"
         yield from (f"  {node}" for node in self.nodes)
 

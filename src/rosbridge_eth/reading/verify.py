@@ -150,7 +150,7 @@ class Verifier:
         # What a reading goes on behind was honest, so what was withheld there was so by an archive.
         self._bodies_withheld = self.findings.counts[Kind.WITHHELD.label]
         self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
-        self._last = b""  # the newest chunk, as it came
+        self._last: bytes | None = None  # the newest chunk, as it came
         self._marked = mark is None or mark.count <= self._at.count  # whether the mark's chunk was compared
         self._timed = -1, 0  # the latest block and its time
         self._signers = [self._signer(event) for event in registrations]
@@ -241,12 +241,12 @@ class Verifier:
             self.findings.add(Kind.WITHHELD, mark.count - 1, detail="the last chunk of the reading before")
 
     def _tail(self) -> str:
-        return keccak(self._last).hex() if self._last else self._at.tail
+        return self._at.tail if self._last is None else keccak(self._last).hex()
 
     def _withhold(self, until: int) -> None:
         if until > self._at.count:
             self.findings.add(Kind.WITHHELD, self._at.count, until - 1, count=until - self._at.count)
-            self._at.count, self._last, self._at.tail = until, b"", ""
+            self._at.count, self._last, self._at.tail = until, None, ""
 
     def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""

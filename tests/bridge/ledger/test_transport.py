@@ -296,7 +296,7 @@ def test_nodes_words_are_understood(words: object, kind: type[ChainError]):
 
 def test_access_keys_and_control_characters_are_not_shown():
     assert shown("https://user:secret@node.example:8545/v3/0123456789abcdef?key=1") == "https://node.example:8545"
-    assert shown("http://[::1]:8545") == "http://::1:8545"
+    assert shown("http://[::1]:8545") == "http://[::1]:8545"
     assert printable("a\x1b[31m\r\nb\u202e") == "a [31m  b"
     assert len(printable("x" * 10_000)) == 300
     with pytest.raises(ChainUnavailable) as caught:
@@ -307,8 +307,9 @@ def test_access_keys_and_control_characters_are_not_shown():
 
 
 @pytest.mark.parametrize("url", [
-    "nonsense", "file:///etc/passwd", "http://", "127.0.0.1:8545", "", "http://127.0.0.1:65536", "http://[::1",
-])
+    "nonsense", "file:///etc/passwd", "http://", "127.0.0.1:8545", "", "http://:8545", "http://127.0.0.1:99999",
+    "http://127.0.0.1:65536", "http://127.0.0.1:x", "http://[::1:8545", "http://[::1", "http://key@/",
+])  # fmt: skip
 def test_what_is_no_url_of_a_node_is_told_as_that(url: str):
     with pytest.raises(ConfigError, match="no URL of a node"):
         Ledger(url, CONTRACT)

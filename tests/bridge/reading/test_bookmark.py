@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 from contextlib import suppress
 from dataclasses import replace
 
@@ -27,6 +28,8 @@ from bridge.reading.world import (
 )
 from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import BridgeError, ConfigError
+from rosbridge_eth.files import write_atomically
+from rosbridge_eth.reading import verdict
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind
 
 TYPE_LINE = line({"type": "pkg/msg/Type", "wire": "ros1", "format": "msg", "definition": "int64 x\n"})
@@ -197,6 +200,29 @@ def test_bookmarks_are_kept_by_ledger_and_robot(tmp_path):
     assert again.get(elsewhere) == other
     assert again.other_ledgers(LOG) == [elsewhere.ledger]
     assert again.other_ledgers(Log(LOG.ledger, b"another" * 4)) == []
+
+
+def test_two_commands_at_once_lose_no_bookmark(tmp_path, monkeypatch):
+    path, mark, elsewhere = tmp_path / "bookmarks.json", read(history()).mark, Log(b"M" * 32, LOG.tk)
+    second = threading.Thread(target=lambda: Bookmarks(path).put(elsewhere, mark))
+
+    def write(path: Path, content: bytes) -> None:
+        if second.ident is None:
+            second.start()
+            second.join(0.3)  # it has come in between, or waits
+        write_atomically(path, content)
+
+    monkeypatch.setattr(verdict, "write_atomically", write)
+    Bookmarks(path).put(LOG, mark)
+    second.join()
+    assert Bookmarks(path).get(LOG) == Bookmarks(path).get(elsewhere) == mark
+
+
+def test_a_bookmark_that_another_command_has_moved_further_stays_there(tmp_path):
+    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
+    bookmarks.put(LOG, Bookmark(9, "ab" * 32, ("a",)))
+    bookmarks.put(LOG, Bookmark(4, "cd" * 32, ("a", "b")))
+    assert bookmarks.get(LOG) == Bookmark(9, "ab" * 32, ("a", "b"))
 
 
 def test_a_crash_while_writing_leaves_the_old_bookmark(tmp_path, monkeypatch):

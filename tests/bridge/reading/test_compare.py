@@ -109,6 +109,25 @@ def test_a_field_that_differs_is_told_by_its_path(tmp_path):
     assert any("in the nearest, f is 0.25 instead of 0.5" in text for text in made.differences)
 
 
+def test_elements_of_arrays_are_held_against_the_message_whatever_number_they_are(tmp_path):
+    definition = "float32[] ranges\nfloat64[2] pair\nbool[] on\nfloat32 f\n"
+    decoder = decoder_for(Wire.ROS1, "acme_msgs/msg/Scan", definition)
+    ranges = numpy.array([0.1, numpy.inf, -numpy.inf, numpy.nan], "f4")
+    made = decoder.typestore.types[decoder.type_name](ranges, numpy.array([numpy.nan, 2]), numpy.array([True]), numpy.inf)
+    raw = RawMessage("/scan", decoder.type_name, T0, decoder.encode(made), decoder)
+    with Writer(tmp_path / "my.bag") as writer:
+        to = writer.add_connection(
+            raw.topic, raw.type_name, msgdef=decoder.definition.text, md5sum=decoder.definition.md5
+        )
+        writer.write(to, raw.received_ns, raw.raw)
+    for fields in ((), ("ranges[1]", "ranges[3]", "on[0]", "f")):
+        [found] = records([raw], fields=fields)
+        assert told(compare(tmp_path / "my.bag", ["/scan"], [found])) == (1, 0), found.data
+    wrong = found._replace(data={"ranges": [0.5, "Infinity", "-Infinity", "NaN"]})
+    [said] = compare(tmp_path / "my.bag", ["/scan"], [wrong]).differences
+    assert said.endswith("ranges[0] is 0.5 instead of 0.10000000149011612")
+
+
 def test_records_in_another_order(tmp_path):
     written = messages(50)
     found = list(records(written))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -23,15 +24,17 @@ from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, odometry, r
 from bridge.reading.world import NAME, START, Pen, authority, message, reader, robot
 from conftest import unavailable
 from ports import free_port
+from rosbridge_eth.capture import parse_line
 from rosbridge_eth.chunk import Chunk, content_key, prove
 from rosbridge_eth.cli import run
-from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
+from rosbridge_eth.errors import ChainError, ConfigError, StoreError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
 from rosbridge_eth.ledger import Ledger, proofs
 from rosbridge_eth.ledger.contract import DataEvent
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
-from rosbridge_eth.reading import Choice
-from rosbridge_eth.reading.evidence import MAX_FILE, Evidence, Statement, ask, verify
+from rosbridge_eth.reading import Choice, Place, ProvenRecord, read_robot
+from rosbridge_eth.reading import evidence as evidence_of
+from rosbridge_eth.reading.evidence import MAX_FILE, Evidence, Statement, ask, make, verify
 from smcrypto import sm3
 from vectors_json import load
 
@@ -227,6 +230,27 @@ def test_a_record_whose_body_is_in_an_archive(node: Anvil, javascript):
     [shown] = both(text, javascript).records
     assert shown.content.data["data"] == "iVBOR" * 600_000
     assert len(text) < 3_000_000 + 20_000
+    with pytest.raises(StoreError, match="archive"):  # which has lost it by the time it is fetched once more
+        made.evidence(Choice("/image"), bodies=lambda digest, size: bodies.pop(digest, None))
+
+
+def test_a_body_that_was_cut_off_makes_no_dropped_or_archived_chunk(node: Anvil, javascript, monkeypatch):
+    """Whoever has the robot's account, the server, can write a header without the body that belongs to it."""
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    chunk = made.pen.write(odometry(1), odometry(2))
+    made.write(on_chain=[replace(chunk, body=b"").encoded])
+    reading = read_robot(
+        [made.ledger], NAME, trust=Trust(ROOTS), reader=reader().encryption_key, now=time.time(),
+        bodies=lambda digest, size: chunk.body,
+    )  # fmt: skip
+    assert list(reading.records()) == [] and reading.verdict().counts == {"forged": 1}
+    [standing] = made.ledger.standings([made.pen.log.tk])
+    place, content = Place(0, b"", 0, b"", standing.data_block, 0, b""), parse_line(odometry(1))
+    monkeypatch.setattr(evidence_of, "verify", lambda *_: None)
+    text = make(reading, [ProvenRecord(place, 0, odometry(1), content, None)]).encode()  # type: ignore[arg-type]
+    with pytest.raises(VerificationError, match="did not sign"):
+        check(text)
+    assert "did not sign" in javascript([text])[0]
 
 
 def test_by_somebody_to_whom_the_keys_were_handed(node: Anvil, javascript):
@@ -662,6 +686,24 @@ def test_a_node_that_gives_no_proofs_is_told():
     made.write(made.pen.write(odometry(1)))
     with pytest.raises(ChainError):
         made.evidence(Choice("/robot_1/odom"))
+
+
+def test_no_more_slots_are_asked_for_at_once_than_nodes_prove():
+    asked: list[Any] = []
+
+    class Node:
+        contract = "0x"
+
+        def ask(self, requests: list[Any], form: Callable[[list[Any]], proofs.Nodes]) -> proofs.Nodes:
+            asked.extend(parameters[1] for _, parameters in requests)
+            proof = [{"accountProof": ["0x80"], "storageProof": [{"proof": [one]} for one in page]} for page in asked]
+            return form(proof)
+
+    header = proofs.Header(7, 0, b"", b"", b"", b"")
+    nodes = proofs.prove_state(Node(), header, range(2_002))  # type: ignore[arg-type]
+    assert len(nodes) == 2_003
+    assert max(map(len, asked)) <= 1_000
+    assert [int(one, 16) for page in asked for one in page] == [*range(2_002)]
 
 
 def test_what_no_file_could_hold_is_refused(recorded: Recorded, monkeypatch: pytest.MonkeyPatch):

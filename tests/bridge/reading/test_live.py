@@ -98,6 +98,15 @@ def test_an_address_that_is_given_is_served_and_one_that_is_taken_is_a_sentence(
     page.close()
 
 
+def test_an_address_may_be_written_in_capitals(watch: Watch, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("rosbridge_eth.reading.live.OWN_NAMES", frozenset())
+    page = Page(Address("LOCALHOST", 0), watch.view)
+    connection = http.client.HTTPConnection(*page.address, timeout=20)
+    connection.request("GET", "/", headers={"Host": f"localhost:{page.address.port}"})
+    assert connection.getresponse().status == 200
+    page.close()
+
+
 def events(answer: Any) -> Iterator[dict[str, Any]]:
     for row in answer:
         if row.startswith(b"data: "):
@@ -125,10 +134,23 @@ def test_each_event_is_all_there_is_to_show_and_bounded(watch: Watch):
     assert len(robot["latest"]) == MAX_TOPICS and len(robot["tracks"]) <= 32
 
 
+def test_a_track_far_from_the_origin_is_no_staircase(watch: Watch):
+    """Coordinates of a map, such as UTM, are millions of metres."""
+    for n in range(3):
+        where = {"pose": {"position": {"x": 691_607.25 + n / 100, "y": 5_334_764.125 + n / 100}}}
+        watch.view.write(NAME, proven(odometry(n, pose=where)))
+    [robot] = json.loads(watch.view.state()[1])["robots"]
+    assert [y for _, y in robot["tracks"][0]["points"][:3]] == [5_334_764.125, 5_334_764.135, 5_334_764.145]
+
+
+def proven(line: bytes, most: int = 2**20) -> ProvenRecord:
+    content = parse_line(line, most)
+    assert isinstance(content, MessageLine)
+    return ProvenRecord(Place(0, b"", 0, b"", 0, 0, b""), 0, line, content, None)
+
+
 def test_of_a_large_record_no_more_is_kept_than_is_shown(watch: Watch):
-    record = parse_line(odometry(1, image="x" * 200_000), 2**20)
-    assert isinstance(record, MessageLine)
-    watch.view.write(NAME, ProvenRecord(Place(0, b"", 0, b"", 0, 0, b""), 0, b"x" * 200_000, record, None))
+    watch.view.write(NAME, proven(odometry(1, image="x" * 200_000)))
     [kept] = watch.view._latest[NAME].values()
     assert isinstance(kept, dict) and len(str(kept)) < 1_000
     [robot] = json.loads(watch.view.state()[1])["robots"]
@@ -267,6 +289,10 @@ def test_a_page_goes_on_when_its_server_is_back(chain: Chain, browser: Browser, 
     browser.until("document.body.innerText.includes('2 positions')")
     assert browser.run("document.querySelectorAll('article').length") == 1
     second.page.close()
+    third = Page(first.page.address, View([], 1, ["robot_9"]))
+    browser.until("document.querySelector('article .name').textContent === 'robot_9'")
+    assert browser.run("document.querySelectorAll('article').length") == 1, "the one that is not read now is gone"
+    third.close()
 
 
 @pytest.mark.service

@@ -493,6 +493,18 @@ def test_a_parquet_file_has_numbers_times_and_lists(tmp_path, monkeypatch):
     assert (rows[1]["header.frame_id"], rows[4]["n"], rows[4]["x"]) == ("=base", None, 0.5)
 
 
+def test_a_field_that_is_named_as_a_column_of_every_table_has_one_of_its_own(tmp_path):
+    fields = {"topic": "mine", "number": 5, "received": 1.5, "received_ns": 6}
+    with outputs.table(tmp_path / "t.csv") as table:
+        table.write(record(1, "pkg/msg/A", fields, "/its"))
+    [row] = read_table(tmp_path / "t.csv")
+    assert (row["topic"], row[".topic"], row[".number"], row["received"]) == ("/its", "mine", "5", "1.5")
+    assert (row["received_ns"], row[".received_ns"]) == (str(T0 + 1), "6")
+    [found] = parquet(tmp_path / "t.parquet", [record(1, "pkg/msg/A", fields, "/its")]).to_pylist()
+    assert (found["topic"], found[".topic"], found[".number"], found[".received"]) == ("/its", "mine", 5, 1.5)
+    assert found["received_ns"] == 6
+
+
 def test_columns_that_hold_this_and_that_are_text(tmp_path):
     rows = [{"a": 1, "b": 1, "c": "NaN", "d": [1], "e": None}, {"a": "x", "b": 2.5, "c": "y", "d": 7, "e": {}}]
     table = parquet(tmp_path / "t.parquet", [record(n, "pkg/msg/A", row) for n, row in enumerate(rows)])

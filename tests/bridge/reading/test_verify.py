@@ -704,6 +704,13 @@ def test_findings_are_counted_beyond_those_that_are_kept():
     assert len(verdict.findings) == 250
     assert sum(map(len, verdict.lines())) < 200_000
     assert any("only the first 250 findings" in text for text in verdict.lines())
+    whole = read([Pen().write(*lines[:250])]).verdict
+    assert len(whole.findings) == 250
+    assert not any("only the first" in text for text in whole.lines())
+
+
+def test_an_empty_chunk_at_the_end_is_malformed_and_the_contract_s_own():
+    read([*Pen().chunks(2), b""]).only(Kind.MALFORMED)
 
 
 def test_definitions_are_bounded():
