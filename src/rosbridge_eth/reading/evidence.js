@@ -639,7 +639,7 @@ const evidence = (() => {
       const governing = signers.findLast((one) => one.first <= at)
       need(governing?.key, `no certificate governs it: ${governing?.why ?? 'none is registered'}`)
       const form = (purpose) => join(utf8.encode(`rosbridge-eth/2 ${purpose}\0`), log, chunk.encoded)
-      const forms = [...(chunk.bare ? ['dropped'] : []), ...(chunk.bare && !chunk.archived ? [] : ['chunk'])]
+      const forms = !chunk.bare ? ['chunk'] : chunk.archived ? ['dropped', 'chunk'] : ['dropped']
       need(forms.some((one) => signed(governing.key, form(one), chunk.r, chunk.s)), 'the robot did not sign its chunk')
       need(chunk.sealed <= governing.until, "its chunk was sealed after the end of the robot's certificate")
       return { ...chunk, block: found.block }

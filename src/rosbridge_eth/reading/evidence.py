@@ -437,11 +437,12 @@ def _proven(reading: Reading, records: Sequence[ProvenRecord], data: Iterable[Da
         for index, encoded in enumerate(event.chunks, event.first):
             if index in numbers:
                 chunk = Chunk.parse(encoded)
+                header = chunk.header
                 if chunk.bare and reading.bodies is not None:
-                    chunk = replace(chunk, body=reading.bodies(chunk.header.body_digest, chunk.header.body_length) or b"")
-                    if sm3.digest(chunk.body) != chunk.header.body_digest:
-                        raise StoreError(f"the archive does not have the body of {chunk.header} any more")
-                key = reading.verifier.key_of(chunk.header)
+                    chunk = replace(chunk, body=reading.bodies(header.body_digest, header.body_length) or b"")
+                    if sm3.digest(chunk.body) != header.body_digest:
+                        raise StoreError(f"the archive does not have the body of {header} any more")
+                key = reading.verifier.key_of(header)
                 lines = open_lines(reading.verifier.log, chunk, key)
                 for one in proofs(lines, key, sorted(numbers[index])):
                     line = lines[one.index].decode()

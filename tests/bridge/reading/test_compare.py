@@ -113,7 +113,8 @@ def test_elements_of_arrays_are_held_against_the_message_whatever_number_they_ar
     definition = "float32[] ranges\nfloat64[2] pair\nbool[] on\nfloat32 f\n"
     decoder = decoder_for(Wire.ROS1, "acme_msgs/msg/Scan", definition)
     ranges = numpy.array([0.1, numpy.inf, -numpy.inf, numpy.nan], "f4")
-    made = decoder.typestore.types[decoder.type_name](ranges, numpy.array([numpy.nan, 2]), numpy.array([True]), numpy.inf)
+    scan = decoder.typestore.types[decoder.type_name]
+    made = scan(ranges, numpy.array([numpy.nan, 2]), numpy.array([True]), numpy.inf)
     raw = RawMessage("/scan", decoder.type_name, T0, decoder.encode(made), decoder)
     with Writer(tmp_path / "my.bag") as writer:
         to = writer.add_connection(
