@@ -34,6 +34,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from eth_utils.crypto import keccak
+
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
@@ -54,7 +56,6 @@ TOPIC = "/robot_1/odom"
 POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pose", "twist.twist")
 NOW = datetime.now(UTC)
 LEDGER, PLACE = bytes(32), Log(bytes(32), robot_id("robot_1"))
-CERTIFICATES = bytes(32)
 GIB = 1 << 30
 
 
@@ -79,7 +80,7 @@ class Identities:
 
     def reception(self, inbox: SqliteInbox) -> Reception:
         server = Server(ServerConfig(), self.server, self.trust, cookie_key(self.server), time.monotonic())
-        return Reception(server, inbox, LEDGER, allowed=lambda peer: True, certificates=lambda name: CERTIFICATES)
+        return Reception(server, inbox, LEDGER, lambda: {PLACE.tk: keccak(self.robot.public.certificates)})
 
 
 class Odometry:

@@ -307,13 +307,13 @@ def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     process = "submitter"
     beat(process, wall)
-    waiting = inbox.totals()
+    waiting, states = inbox.totals(), inbox.states([*names])
     for tk, name in names.items():
         held = waiting.get(tk, Waiting(0, 0, 0, None))
         WAITING.labels(name).set(held.chunks)
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
-        HELD.labels(name).set(inbox.state(tk).hold is not None)
+        HELD.labels(name).set(states[tk].hold is not None)
         GAS.labels(name).set(submitter.gas[tk])
         if standing := submitter.standings.get(tk):
             ON_CHAIN.labels(name).set(standing.chunks)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -75,6 +76,7 @@ class Registry:
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.executescript(SCHEMA)
             self._file = path.stat()
+            self._robots: tuple[tuple[int, int], dict[bytes, Enrolment]] | None = None  # by revision
             begun = set(self._db.execute("SELECT role, name FROM enrolment"))
         except (sqlite3.Error, OSError) as error:
             raise StoreError(self._lost(f"it cannot be used as a database, {error}")) from error
@@ -175,9 +177,17 @@ class Registry:
         """The readers in force."""
         return [reader for reader in self.all(Role.READER) if reader.revoked_at is None]
 
-    def robots(self) -> dict[bytes, Enrolment]:
-        """Every robot there ever was: Tk to its newest enrolment, in force or not."""
-        return {robot.tk: robot for robot in self.all(Role.ROBOT)}
+    def robots(self) -> Mapping[bytes, Enrolment]:
+        """Every robot there ever was: Tk to its newest enrolment, in force or not. Read again only after a change, so
+        that a server of thousands may ask every second; StoreError as `revision`."""
+        revision = self.revision()
+        if self._robots is None or self._robots[0] != revision:
+            self._robots = revision, {robot.tk: robot for robot in self.all(Role.ROBOT)}
+        return self._robots[1]
+
+    def in_force(self) -> dict[bytes, bytes]:
+        """Every robot in force: Tk to keccak256 of its certificates. StoreError as `revision`."""
+        return {tk: robot.hash for tk, robot in self.robots().items() if robot.revoked_at is None}
 
     def names(self) -> dict[bytes, str]:
         """Every robot there ever was: Tk to its name."""

@@ -14,10 +14,12 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+from eth_utils.crypto import keccak
 
 from rosbridge_eth import protocol
 from rosbridge_eth.archive import Archive
@@ -82,6 +84,7 @@ class Session:
     connection: bytes
     peer: PeerIdentity
     tk: bytes
+    certificates: bytes  # keccak256 of them
     heard: float
     stream: bytes | None = None  # the one it asked about or sent last
     asked: bool = False  # it is to be told what is stored of that stream
@@ -96,15 +99,15 @@ class Session:
 class Reception:
     """Answers the robots of one worker.
 
-    certificates: keccak256 of the certificates that the operator's registry has in force for a name, None where the
-    name has none; the contract's are in the inbox's state. allowed: whether a session may go on. archive: for the
-    bodies of archived chunks; without one a robot that has such chunks is told to hold.
+    in_force: the robots that may have a session, by Tk, and keccak256 of their certificates in the operator's registry;
+    asked once a second. Those that the contract has are in the inbox's state. archive: for the bodies of archived
+    chunks; without one a robot that has such chunks is told to hold.
     counts: chunks by outcome; records: by robot's name, those stored; newest: when it sealed the last of them.
     """
 
     def __init__(
-        self, server: Server, inbox: Inbox, ledger: bytes, *, allowed: Callable[[PeerIdentity], bool],
-        certificates: Callable[[str], bytes | None], archive: Archive | None = None,
+        self, server: Server, inbox: Inbox, ledger: bytes, in_force: Callable[[], Mapping[bytes, bytes]],
+        archive: Archive | None = None,
     ) -> None:  # fmt: skip
         self._archive, self._threads = archive, ThreadPoolExecutor(PUTS, "archive")  # which starts them when needed
         self._arriving: dict[bytes, Arriving] = {}  # by Tk; outlives a session, so that the next one goes on with it
@@ -112,7 +115,7 @@ class Reception:
         self._probe = None if archive is None else self._threads.submit(archive.check)
         self.archive_trouble = Trouble(log, "the archive")
         self.server, self._inbox, self._ledger = server, inbox, ledger
-        self._allowed, self._certificates = allowed, certificates
+        self._in_force = in_force
         self.sessions: dict[bytes, Session] = {}
         self._gone: dict[str, Session] = {}  # by name: sessions that a newer one of the same identity replaced
         self._commit_at: float | None = None
@@ -129,7 +132,7 @@ class Reception:
         """Take one event; what it asks for is answered by `commit`."""
         match event:
             case Connected(peer=peer, connection=connection):
-                session = Session(connection, peer, robot_id(peer.name), now)
+                session = Session(connection, peer, robot_id(peer.name), keccak(peer.certificates), now)
                 self.sessions[connection] = session
                 before = self._gone.pop(peer.name, None)
                 if before is not None and now - before.heard <= ALIVE:
@@ -312,8 +315,7 @@ class Reception:
 
         wall: seconds since 1970, for the inbox.
         """
-        enough = sum(len(session.offers) for session in self.sessions.values()) >= ENOUGH
-        if self._commit_at is not None and (now >= self._commit_at or enough):
+        if self._commit_at is not None and (now >= self._commit_at or self._gathered() >= ENOUGH):
             self._commit_at = None
             self.commit(now, wall)
         if now >= self._look_at:
@@ -321,6 +323,9 @@ class Reception:
             self._append([], now, wall)
             self._look_at_archive(now)
             self.look(now)
+
+    def _gathered(self) -> int:
+        return sum(len(session.offers) for session in self.sessions.values())
 
     def commit(self, now: float, wall: float) -> None:
         """Everything gathered goes into the inbox by one commit; then each robot is answered."""
@@ -394,18 +399,20 @@ class Reception:
 
     def look(self, now: float) -> None:
         """Tell what is confirmed, ask those that hold to go on, close the sessions of who is not allowed any more."""
-        for session in list(self.sessions.values()):
-            if not self._allowed(session.peer):
+        in_force, sessions = self._in_force(), [*self.sessions.values()]
+        try:
+            states = self._inbox.states([session.tk for session in sessions])
+        except StoreError as error:
+            self.trouble.now(str(error))
+            states = {}
+        for session in sessions:
+            if in_force.get(session.tk) != session.certificates:
                 log.warning("%s is no longer allowed; its session is closed", session.peer)
                 self.server.close_peer(session.peer.name)
                 continue
-            try:
-                state = self._inbox.state(session.tk)
-            except StoreError as error:
-                self.trouble.now(str(error))
-                return
-            ours = (None, self._certificates(session.peer.name))
-            session.mismatch = None if state.certificates_hash in ours else MISMATCH
+            if (state := states.get(session.tk)) is None:
+                continue
+            session.mismatch = None if state.certificates_hash in (None, session.certificates) else MISMATCH
             if state.confirmed is not None and state.confirmed != session.confirmed:
                 session.confirmed = state.confirmed
                 self._send(session, Confirmed(*state.confirmed, state.block))

@@ -33,14 +33,14 @@ from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.config import load_server_config, reread
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
-from rosbridge_eth.identity import Identity, Role
+from rosbridge_eth.identity import Identity
 from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.ledger.submitter import Settings as SubmitterSettings
 from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.logs import Trouble
-from rosbridge_eth.registry import Enrolment, Registry
+from rosbridge_eth.registry import Registry
 from rosbridge_eth.server import Reception, Worker
 
 if TYPE_CHECKING:
@@ -107,34 +107,19 @@ def open_reception(
         handshake_share=limits.handshake_share, source_rate=limits.source_rate,
     )
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
-
-    def certificates(name: str) -> bytes | None:
-        found = registry.find(Role.ROBOT, name)
-        return None if found is None else found.hash
-
     archive = None if config.archive is None else open_archive(config.archive)
-    return Reception(
-        server, inbox, deployment.ledger, allowed=registry.allows, certificates=certificates, archive=archive
-    )
+    return Reception(server, inbox, deployment.ledger, registry.in_force, archive)
 
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
     """The submitter for all robots of a registry."""
-    known: dict[object, dict[bytes, Enrolment]] = {}  # the robots, by the registry's revision
-
-    def robots() -> dict[bytes, Enrolment]:
-        revision = registry.revision()
-        if revision not in known:
-            known.clear()
-            known[revision] = registry.robots()
-        return known[revision]
 
     def account(tk: bytes) -> LocalAccount | None:
-        found = robots().get(tk)
+        found = registry.robots().get(tk)
         return None if found is None else keys.robot(found.number)
 
     return Submitter(
-        ledger, inbox, lambda: robots().keys(), account, keys.operator,
+        ledger, inbox, lambda: registry.robots().keys(), account, keys.operator,
         SubmitterSettings(
             confirmations=config.chain.confirmations, max_fee=int(config.chain.max_fee_gwei * 10**9),
             low_water=int(config.funds.below * WEI_PER_ETH), top_up=int(config.funds.by * WEI_PER_ETH),

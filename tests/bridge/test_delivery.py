@@ -14,6 +14,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import pytest
+from eth_utils.crypto import keccak
 
 from bridge.channel.simulation import Faults, Network
 from rosbridge_eth import identity as ids
@@ -59,7 +60,7 @@ class World:
         self.network = Network(seed, faults)
         self.random = random.Random(seed)
         self.folder, self.room = folder, room
-        self.allowed, self.certificates = True, b"c" * 32
+        self.allowed, self.certificates = True, keccak(identity(ids.Role.ROBOT).public.certificates)
         self.lines: list[bytes] = []
         self.unspooled_lines = 0
         self.open_server()
@@ -76,7 +77,7 @@ class World:
         self.server = Server(ServerConfig(), identity(ids.Role.SERVER), ids.Trust((authority().certificate,)),
                              cookie_key(identity(ids.Role.SERVER)), self.network.now, wall=wall, stopwatch=lambda: 0.0)
         self.reception = Reception(
-            self.server, self.inbox, LEDGER, allowed=lambda peer: self.allowed, certificates=lambda name: b"c" * 32
+            self.server, self.inbox, LEDGER, lambda: {PLACE.tk: self.certificates} if self.allowed else {}
         )
 
     def open_robot(self) -> None:
@@ -279,7 +280,7 @@ def test_a_robot_whose_certificates_the_contract_does_not_have_is_told_to_hold(t
     world.capture(5)
     assert world.run(60, until=lambda: world.sender.statistics.held == MISMATCH)
     assert world.stored() == []
-    world.inbox.set_state(PLACE.tk, certificates_hash=b"c" * 32)
+    world.inbox.set_state(PLACE.tk, certificates_hash=world.certificates)
     assert world.run(60)
     assert world.stored_lines() == world.lines
 

@@ -9,11 +9,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from eth_utils.crypto import keccak
 
 from bridge.machine import PATIENCE, Machine, Running
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Disconnected, End, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.server import Reception, Worker
 
@@ -30,8 +32,8 @@ def serving(tmp_path: Path) -> Iterator[Running]:
     [sock] = server_sockets(("127.0.0.1", 0))
     server = Server(ServerConfig(), HUB, TRUST, cookie_key(HUB), time.monotonic())
     reception = Reception(
-        server, SqliteInbox(tmp_path / "inbox.sqlite", LEDGER, 1 << 24, 1 << 24), LEDGER, allowed=lambda peer: True,
-        certificates=lambda name: None,
+        server, SqliteInbox(tmp_path / "inbox.sqlite", LEDGER, 1 << 24, 1 << 24), LEDGER,
+        lambda: {robot_id(robot.name): keccak(robot.public.certificates) for robot in ROBOTS},
     )  # fmt: skip
     running = Running(Worker(reception, lambda handle: UdpLoop(server, sock, handle)))
     yield running

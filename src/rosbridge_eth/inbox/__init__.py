@@ -151,24 +151,21 @@ class Inbox(Protocol):
     def _put_in_front(self, tk: bytes, front: Sequence[Chunk], on_chain: set[bytes], now: float) -> None:
         """Remove the rows whose digest is in `on_chain`, then make `front` the first rows."""
 
-    def _load(self, tk: bytes) -> str | None:
-        """The text last given to `_save`, which need not outlive a power cut."""
+    def _load(self, tks: Sequence[bytes]) -> Sequence[str | bytes | None]:
+        """The texts last given to `_save`, which need not outlive a power cut."""
 
     def _save(self, tk: bytes, text: str) -> None:
         """Keep a text about a robot."""
 
     # What they have in common
 
+    def states(self, tks: Sequence[bytes]) -> dict[bytes, RobotState]:
+        """What was set last of each, or nothing at all."""
+        return {tk: _state(text) for tk, text in zip(tks, self._load(tks), strict=True)}
+
     def state(self, tk: bytes) -> RobotState:
         """What was set last, or nothing at all."""
-        text = self._load(tk)
-        if text is None:
-            return RobotState()
-        confirmed, hold, certificates_hash, *rest = json.loads(text)
-        return RobotState(
-            confirmed and (bytes.fromhex(confirmed[0]), confirmed[1]), hold,
-            certificates_hash and bytes.fromhex(certificates_hash), *rest,
-        )  # fmt: skip
+        return self.states([tk])[tk]
 
     def set_state(self, tk: bytes, **changes: Any) -> None:
         """Change fields of the state, such as `hold`. A power cut may take it back."""
@@ -248,7 +245,17 @@ class Inbox(Protocol):
 
     def totals(self) -> dict[bytes, Waiting]:
         """What waits, of every robot."""
-        return {tk: self.waiting(tk, self.state(tk).position) for tk in self.sizes()}
+        return {tk: self.waiting(tk, state.position) for tk, state in self.states([*self.sizes()]).items()}
+
+
+def _state(text: str | bytes | None) -> RobotState:
+    if text is None:
+        return RobotState()
+    confirmed, hold, certificates_hash, *rest = json.loads(text)
+    return RobotState(
+        confirmed and (bytes.fromhex(confirmed[0]), confirmed[1]), hold,
+        certificates_hash and bytes.fromhex(certificates_hash), *rest,
+    )  # fmt: skip
 
 
 def open_inbox(

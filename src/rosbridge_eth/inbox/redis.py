@@ -193,10 +193,12 @@ class RedisInbox(Inbox):
             found = self._redis.xrevrange(self._prefix + "dead", count=limit)
         return [DeadLetter(row[b"t"], row[b"w"].decode(), float(row[b"a"]), row[b"c"]) for _, row in found]
 
-    def _load(self, tk: bytes) -> str | None:
+    def _load(self, tks: Sequence[bytes]) -> Sequence[str | bytes | None]:
         with self._talking():
-            found = self._redis.get(self._key("state", tk))
-        return None if found is None else str(found, "utf-8")
+            pipe = self._redis.pipeline(transaction=False)
+            for tk in tks:
+                pipe.get(self._key("state", tk))
+            return list(pipe.execute())
 
     # What is asked of Redis, and talking to it
 

@@ -190,9 +190,10 @@ class SqliteInbox(Inbox):
 
         self._db.write(put)
 
-    def _load(self, tk: bytes) -> str | None:
-        rows = self._read("SELECT state FROM robot WHERE tk = ?", tk)
-        return rows[0][0] if rows else None
+    def _load(self, tks: Sequence[bytes]) -> Sequence[str | bytes | None]:
+        with self._db.errors():
+            found = (self._db.one("SELECT state FROM robot WHERE tk = ?", (tk,)) for tk in tks)
+            return [row and row[0] for row in found]
 
     def _save(self, tk: bytes, text: str) -> None:
         save = "INSERT INTO robot (tk, state) VALUES (?, ?) ON CONFLICT DO UPDATE SET state = excluded.state"

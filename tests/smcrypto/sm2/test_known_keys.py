@@ -14,6 +14,7 @@ from smcrypto.sm2 import known_keys as module
 from smcrypto.sm2.known_keys import KnownKeys, known_keys
 from smcrypto.sm2.points import Comb
 
+WIDTH_3 = 4 * 8  # points of a comb of that width: rows, and both signs of four odd multiples
 POINTS = [reference.multiple(k, TINY_1009.G, TINY_1009) for k in range(1, 40)]
 
 
@@ -75,7 +76,7 @@ def test_the_same_point_of_another_curve_is_another_key():
 
 
 def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
-    memory = KnownKeys(stages=((1, 3),), combs=3)
+    memory = KnownKeys(stages=((1, 3),), points=3 * WIDTH_3)
     for P in POINTS[:3]:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
@@ -88,7 +89,31 @@ def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
     for P in POINTS:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
-        assert len(memory) <= 3
+        assert len(memory) == 3
+
+
+def test_keys_that_take_turns_do_not_take_each_others_combs():
+    """More keys than there is room for, in turn: those that have a comb keep it, and none is built in vain."""
+    memory = KnownKeys(stages=((2, 3),), points=3 * WIDTH_3)
+    for _ in range(5):
+        combs = []
+        for P in POINTS[:20]:
+            combs.append(memory.comb(TINY_1009, P))
+            use(memory, P, 1)
+    assert [comb is not None for comb in combs] == [True] * 3 + [False] * 17
+    use(memory, POINTS[30], 2)  # this one comes back at once, and theirs was a round ago
+    assert memory.comb(TINY_1009, POINTS[30]) is not None
+    assert memory.comb(TINY_1009, POINTS[0]) is None
+
+
+def test_a_wider_comb_takes_nobody_elses_place():
+    memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
+    for P in POINTS[:3]:
+        use(memory, P, 1)
+        memory.comb(TINY_1009, P)
+    use(memory, POINTS[0], 9)
+    assert memory.comb(TINY_1009, POINTS[0]).width == 3
+    assert len(memory) == 3
 
 
 def test_the_number_of_candidates_is_bounded():
@@ -133,7 +158,7 @@ def test_results_are_the_same_before_and_after_a_key_is_known(monkeypatch):
 
 
 def test_several_threads_share_the_memory():
-    memory = KnownKeys(stages=((2, 3), (20, 5)), combs=4)
+    memory = KnownKeys(stages=((2, 3), (20, 5)), points=4 * WIDTH_3)
 
     def work(i: int) -> None:
         P = POINTS[i % 6]
@@ -143,9 +168,10 @@ def test_several_threads_share_the_memory():
         memory.used(TINY_1009, P)
 
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(work, range(500)))
-    assert len(memory) <= 4
+        list(pool.map(work, range(2000)))
+    assert 1 <= len(memory) <= 4
+    assert memory._points == sum(len(row) for known in memory._known.values() for row in known.comb.rows)
 
 
 def test_the_shared_memory_is_bounded():
-    assert known_keys._limits == (32, 1024)
+    assert known_keys._limits == (262_144, 1024)
