@@ -4,8 +4,9 @@ With a comb, verifying and encrypting take a fifth to a quarter of the time, but
 one costs as much as several verifications: 3.5 ms for a narrow one, 10 ms for a wide one. So
 a key earns them by being used. Only what succeeded counts, so that nobody
 makes us build tables for keys that sign nothing. The least recently used go first, and only
-for a key that was met again sooner: where more keys take turns than there is room for, those
-that have a comb keep it, and no time goes into combs that are gone before they are used.
+for a key that was used for longer than its comb costs, and met again sooner: where more keys
+take turns than there is room for, those that have a comb keep it, and no time goes into combs
+that are gone before they are used.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from smcrypto.sm2.points import Comb
 __all__ = ["KnownKeys", "known_keys"]
 
 _Key: TypeAlias = tuple[Curve, Point]
+_TAKES_A_PLACE: Final = 16  # uses after which a key may have the comb of another one go
 
 
 class _Record:
@@ -84,10 +86,11 @@ class KnownKeys:
         return comb
 
     def _may_build(self, record: _Record, points: int) -> bool:
-        """Whether there is room; for a first comb also if some key that has one was not met since this one was."""
+        """Whether there is room, or (for a first comb) some key that has one was not met since this one was."""
         if not self._known or self._points + points <= self._limits[0]:
             return True
-        return record.comb is None and record.last > next(iter(self._known.values())).last
+        oldest = next(iter(self._known.values()))
+        return record.comb is None and record.uses >= _TAKES_A_PLACE and record.last > oldest.last
 
     def used(self, curve: Curve, P: Point) -> None:
         """Count one use of P that succeeded."""

@@ -81,13 +81,15 @@ def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
     memory.comb(TINY_1009, POINTS[0])
+    use(memory, POINTS[3], 15)
+    assert memory.comb(TINY_1009, POINTS[3]) is None, "a comb costs more than that"
     use(memory, POINTS[3], 1)
-    memory.comb(TINY_1009, POINTS[3])
+    assert memory.comb(TINY_1009, POINTS[3]) is not None
     assert len(memory) == 3
     assert memory.comb(TINY_1009, POINTS[0]) is not None
     assert memory.comb(TINY_1009, POINTS[1]) is None
     for P in POINTS:
-        use(memory, P, 1)
+        use(memory, P, 16)
         memory.comb(TINY_1009, P)
         assert len(memory) == 3
 
@@ -95,13 +97,13 @@ def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
 def test_keys_that_take_turns_do_not_take_each_others_combs():
     """More keys than there is room for, in turn: those that have a comb keep it, and none is built in vain."""
     memory = KnownKeys(stages=((2, 3),), points=3 * WIDTH_3)
-    for _ in range(5):
+    for _ in range(20):
         combs = []
         for P in POINTS[:20]:
             combs.append(memory.comb(TINY_1009, P))
             use(memory, P, 1)
     assert [comb is not None for comb in combs] == [True] * 3 + [False] * 17
-    use(memory, POINTS[30], 2)  # this one comes back at once, and theirs was a round ago
+    use(memory, POINTS[30], 16)  # this one comes back at once, and theirs was a round ago
     assert memory.comb(TINY_1009, POINTS[30]) is not None
     assert memory.comb(TINY_1009, POINTS[0]) is None
 
