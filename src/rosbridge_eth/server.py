@@ -138,7 +138,8 @@ class Reception:
                 if before is not None and now - before.heard <= ALIVE:
                     log.warning(
                         "%s: a session took the place of one that was alive: the robot was killed and started again,"
-                        " or two machines have its identity; then revoke it and register it anew", peer,
+                        " or heard nothing from a server that is too busy, or two machines have its identity; then"
+                        " revoke it and register it anew", peer,
                     )  # fmt: skip
                 log.info("%s: session begun", peer)
                 self._look_at = now  # its handshake may have been allowed before the list changed
