@@ -26,7 +26,7 @@ from rosbridge_eth.blackbox import BlackBox, Record
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
-from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.chunk import MAX_READERS, Chunk, Log, drop, robot_id
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.values import parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
@@ -150,8 +150,8 @@ class Robot:
                 if not finished and self._source_ended.is_set() and not self._ring and not self.box.released:
                     finished = True
                     self._finish(now)
-                elif not finished:
-                    self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
+                else:
+                    self._spool_chunks([] if finished else self.writer.closed(now, time.time_ns() // 10**6), now)
                 self._spool_or(None, partial(self.sender.send, now))
                 on_turn()
                 if finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
@@ -163,16 +163,21 @@ class Robot:
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 if not finished:
                     self._finish(time.monotonic())
+                self._spool_at = float("-inf")  # the last chunks do not wait
+                self._spool_chunks([], time.monotonic())
                 self._last_words()
         finally:
             self._stop.set()
             self._room.set()
-            self._leave()
-            self.source.close()
-            reading.join(timeout=5)
-            self.summary = self._spool_or("the spool cannot be read", self._summarise)
-            self.spool.close()
-            self.loop.close()
+            try:
+                self.client.close(time.monotonic())  # so that the server need not wait for a silent robot
+                self.loop.step(0.0)
+            finally:
+                self.source.close()
+                reading.join(timeout=5)
+                self.summary = self._spool_or("the spool cannot be read", self._summarise)
+                self.spool.close()
+                self.loop.close()
         if self._source_error is not None:
             raise self._source_error
 
@@ -295,26 +300,20 @@ class Robot:
             self.spool_trouble.now(str(error))
             return otherwise
 
-    def _leave(self) -> None:
-        """End the session in good order, so that the server need not wait for a silent robot."""
-        self.client.close(time.monotonic())
-        self.loop.step(0.0)
-
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender.statistics
-        left = spool.unstored + len(self._unspooled)
         lost = {
             "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
             "records that there was no memory for until their event": self.box.lost.total(),
+            "chunks lost, since the spool took nothing": len(self._unspooled),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{self.captured} records captured in {self.chunks} chunks"]
         parts += [f"{count} {what}" for what, count in lost.items() if count]
-        parts += [f"{left} chunks kept for later"]
-        line = ", ".join(parts)
-        if not left:
+        line = ", ".join([*parts, f"{spool.unstored} chunks kept for later"])
+        if not spool.unstored:
             return f"{line}."
         if sender.refusal is not None:
             return f"{line}: {sender.refusal}."
@@ -332,6 +331,14 @@ def certificate_clock(home: RobotHome) -> Callable[[], datetime]:
     return lambda: datetime.fromtimestamp(max(time.time(), home.clock_floor()), UTC)
 
 
+def keep_time(home: RobotHome, seconds: float) -> None:
+    """Keep the time that a server proved, for this clock; on a full disk the next server's will do."""
+    try:
+        home.raise_clock_floor(seconds)
+    except OSError as error:
+        log.warning("the server's time cannot be kept for the next start: %s", error.strerror)
+
+
 def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
     """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first."""
     trust, keys = Trust(roots), []
@@ -343,6 +350,10 @@ def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certi
         born = max(signing.not_before, encryption.not_before)
         peer = trust.check(signing.to_der(), encryption.to_der(), role=Role.READER, at=born)
         keys.append(peer.encryption_certificate.public_key)
+    if len(keys) > MAX_READERS:
+        raise ConfigError(
+            f"there are {len(keys)} readers, and a chunk is for {MAX_READERS} at most; people may share a reader's key"
+        )
     return keys
 
 
@@ -374,7 +385,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
         ClientConfig(mode=Mode[config.channel.upper()]), identity, Trust(roots), end.server_name, now,
         wall=certificate_clock(home),
     )
-    sender = Sender(client, spool, channel=config.channel, on_server_time=home.raise_clock_floor)
+    sender = Sender(client, spool, channel=config.channel, on_server_time=partial(keep_time, home))
     socket, address = client_socket(config.server or parse_address(end.server_address))
     robot = Robot(
         source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender,

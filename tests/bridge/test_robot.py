@@ -13,10 +13,10 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
-from rosbridge_eth.channel import Client, ClientConfig, Message
+from rosbridge_eth.channel import Client, ClientConfig, HandshakeFailed, Message
 from rosbridge_eth.channel.udp import client_socket, server_sockets
-from rosbridge_eth.chunk import Log, drop, robot_id
-from rosbridge_eth.errors import StoreError
+from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.errors import NetworkError, StoreError
 from rosbridge_eth.protocol import Confirmed
 from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.sender import Sender
@@ -39,6 +39,7 @@ class Source:
         self.messages, self.count, self.emitted = list(bag.messages()), count, 0
         bag.close()
         self.lost: dict[tuple[str, str], int] = {}
+        self.closed = False
 
     def run(self, emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
         while self.emitted < self.count and not stop.is_set():
@@ -46,7 +47,7 @@ class Source:
             self.emitted += 1
 
     def close(self) -> None:
-        """Nothing is open."""
+        self.closed = True
 
 
 @pytest.fixture
@@ -129,6 +130,83 @@ def test_a_spool_that_cannot_be_read_does_not_end_a_robot(
     assert turns == 10
     assert robot.summary == "the spool cannot be read"
     assert "the disk is gone" in caplog.text
+
+
+class Full:
+    """The spool's `append`, on a disk that is full as long as `full` says so."""
+
+    def __init__(self, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.append, self.full = robot.spool.append, True
+        monkeypatch.setattr(robot.spool, "append", self)
+
+    def __call__(self, chunk: Chunk) -> None:
+        if self.full:
+            raise StoreError("the disk is full; make room")
+        self.append(chunk)
+
+
+def test_what_the_spool_took_nothing_of_until_the_end_is_not_said_to_be_kept(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make(100)
+    Full(robot, monkeypatch)
+    robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
+    assert f"{robot.chunks} chunks lost, since the spool took nothing" in robot.summary
+    assert "0 chunks kept for later" in robot.summary and "the next start" not in robot.summary
+
+
+def test_a_robot_that_is_stopped_tries_the_spool_once_more(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make(100)
+    spool = Full(robot, monkeypatch)
+    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 3600)
+
+    def on_turn() -> None:
+        if robot._unspooled and robot.captured == 100:
+            spool.full = False
+            robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert f"{robot.chunks} chunks kept for later" in robot.summary and "lost" not in robot.summary
+
+
+def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make(100)
+    spool, turns = Full(robot, monkeypatch), 0
+    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.0)
+
+    def on_turn() -> None:
+        nonlocal turns
+        if robot._unspooled and robot._unspooled[-1].header.goodbye:
+            spool.full = False
+        if not spool.full:
+            turns += 1
+            assert turns < 20, "the spool takes chunks again, and is not given those that wait"
+            if not robot._unspooled:
+                robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert f"{robot.chunks} chunks kept for later" in robot.summary
+
+
+def test_a_server_that_says_what_is_no_message_again_while_the_robot_leaves(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make(10)
+    monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(HandshakeFailed("")))
+
+    def refuses(*arguments: object) -> None:
+        raise NetworkError("the server says what is no message here")
+
+    monkeypatch.setattr(robot.sender, "handle", refuses)
+    with pytest.raises(NetworkError):
+        robot.run()
+    assert robot.source.closed, "whoever publishes is told that nobody listens any more"  # type: ignore[attr-defined]
+    with pytest.raises(StoreError):
+        robot.spool.statistics()
 
 
 def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: Callable[[int], Robot]) -> None:

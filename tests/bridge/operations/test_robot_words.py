@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import logging
 import re
+from contextlib import closing
 from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 
 import pytest
 
+from bridge import disks
+from bridge.lone_robot import CA, NOW, READER, lone_robot
 from bridge.operations.conftest import PASSWORD, Place
 from rosbridge_eth import robot as module
-from rosbridge_eth.channel import ClientConfig, HandshakeFailed, Reason
+from rosbridge_eth.channel import ClientConfig, Connected, HandshakeFailed, Reason
+from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.config import Address, load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot import Robot, open_robot
+from rosbridge_eth.robot import Robot, open_robot, reader_keys
 from rosbridge_eth.sources import sample_bag
 
 NO_SERVER = 'server = "127.0.0.1:9"\n'
@@ -55,6 +60,32 @@ def test_a_reason_is_said_with_its_mend_and_at_most_once_a_minute(place: Place, 
     assert [sum(why in line for line in said) for why in ("it is silent", "it refuses")] == [3, 3]
     assert all("register --replace" in line and "join" in line for line in said if "it refuses" in line)
     assert all('channel = "exchange"' in line for line in said if "it is silent" in line)
+
+
+def test_a_disk_that_is_full_when_a_session_begins_does_not_end_a_robot(tmp_path: Path, caplog: Logged) -> None:
+    with disks.small_disk(tmp_path / "disk", "5m") as disk:
+        home = lone_robot(disk)
+        home.config.write_text(ODOM + '[source]\nkind = "sim"\n')
+        robot = open_robot(home, load_robot_config(home.config), b"robot's")
+        with closing(robot.spool), closing(robot.loop):
+            ballast = disks.fill_up(disk)
+            robot.handle(Connected(READER.public, bytes(8), NOW))
+            assert robot.sender.statistics.connected and "cannot be kept" in caplog.text
+            ballast.unlink()
+            robot.handle(Connected(READER.public, bytes(8), NOW))
+            assert home.clock_floor() == pytest.approx(NOW.timestamp(), abs=1)
+
+
+def test_more_readers_than_a_chunk_may_have_are_refused_before_it_is_sealed_for_them(tmp_path: Path) -> None:
+    home = lone_robot(tmp_path)
+    home.config.write_text(ODOM + '[source]\nkind = "sim"\n')
+    for number in range(MAX_READERS - 1):
+        (home.readers / f"reader_{number}.pem").write_bytes(READER.public.pem)
+    config, roots = load_robot_config(home.config), [CA.certificate]
+    assert len(reader_keys(config, home, roots)) == MAX_READERS
+    (home.readers / "one_more.pem").write_bytes(READER.public.pem)
+    with pytest.raises(ConfigError, match="there are 17 readers, and a chunk is for 16 at most"):
+        reader_keys(config, home, roots)
 
 
 def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
