@@ -63,8 +63,9 @@ class Database:
         self.path, self._what, self._wal_pages = path, what, wal_pages
         self._exclusive = exclusive and not read_only
         self._reserve = path.with_name(path.name + ".reserve")
+        self._nothing = NothingThere(f"there is no {what} {path} yet")
         if read_only and not path.exists():
-            raise NothingThere(f"there is no {what} {path} yet")
+            raise self._nothing
         try:
             if not read_only:
                 os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
@@ -90,7 +91,9 @@ class Database:
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")  # and no -shm file, which would need room
             self._db.execute("PRAGMA temp_store = MEMORY")
             found, version = self.one("PRAGMA application_id")[0], self.one("PRAGMA user_version")[0]
-            if found == 0 and self.one("SELECT count(*) FROM sqlite_master")[0] == 0 and not read_only:
+            if found == 0 and self.one("SELECT count(*) FROM sqlite_master")[0] == 0:
+                if read_only:
+                    raise self._nothing
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.executescript(
                     f"BEGIN IMMEDIATE; {schema} PRAGMA application_id = {application};"
@@ -169,9 +172,10 @@ class Database:
 
     def _reserved(self) -> bool:
         """Whether the reserve is there, or could be made."""
-        if self._reserve.exists():
+        size = 2 * self._wal_pages * _PAGE
+        if self._reserve.exists() and self._reserve.stat().st_size == size:  # a crash may have cut it short
             return True
-        size, room = 2 * self._wal_pages * _PAGE, os.statvfs(self.path.parent)
+        room = os.statvfs(self.path.parent)
         if room.f_bavail * room.f_frsize < size:
             return False
         try:

@@ -175,6 +175,7 @@ class Sender:
                 self._stream, self._asked, self.statistics.held = None, False, None
             case Stored(stream=stream, number=number) if stream == self._stream:
                 if self._asked:  # the server's word for what is there, ours for what follows
+                    self._spool.lost(stream, number)
                     self._sent, self._asked = number, False
                 self._stored = number
                 if number is not None:

@@ -52,7 +52,7 @@ CREATE TABLE IF NOT EXISTS spool (
     less="UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size"
     " WHERE state = old.state;",
 )
-_OLDEST: Final = "SELECT position, records, chunk FROM chunk WHERE state = ? ORDER BY position LIMIT 1"
+_OLDEST: Final = "SELECT position, chunk FROM chunk WHERE state = ? ORDER BY position LIMIT 1"
 # The place in the log of a stream's newest chunk up to a number.
 _UP_TO: Final = "(SELECT position FROM chunk WHERE stream = ? AND number <= ? ORDER BY number DESC LIMIT 1)"
 
@@ -145,16 +145,16 @@ class Spool:
                     self._remove(state, *row)
                     break
 
-    def _remove(self, state: int, position: int, records: int, encoded: bytes) -> None:
+    def _remove(self, state: int, position: int, encoded: bytes) -> None:
+        chunk = Chunk.parse(encoded)
         self._db.run("DELETE FROM chunk WHERE position = ?", (position,))
         if state == _WHOLE:  # put back: an UPDATE would leave it a page of its own
-            self._insert(position, self._drop(Chunk.parse(encoded)))
+            self._insert(position, self._drop(chunk))
         if state != _STORED:
-            bodies = int(state != _BARE)
             self._db.run(
                 "UPDATE spool SET dropped_bodies = dropped_bodies + ?, dropped_headers = dropped_headers + ?,"
                 " dropped_records = dropped_records + ?",
-                (bodies, int(state != _WHOLE), bodies * records),
+                (bool(chunk.body), state != _WHOLE, chunk.header.records if chunk.body else 0),
             )
 
     def first_unconfirmed(self) -> tuple[bytes, int, bytes] | None:
@@ -178,11 +178,10 @@ class Spool:
     def following(self, stream: bytes, number: int | None, limit_bytes: int) -> list[Chunk]:
         """The chunks of a stream above a number (None: from its first), in order; at least one, if there is any."""
         chunks: list[Chunk] = []
-        after = b"" if number is None else _sortable(number)
         with self._db.errors():
             for (encoded,) in self._db.run(
                 "SELECT chunk FROM chunk WHERE stream = ? AND number > ? AND state != ? ORDER BY number",
-                (stream, after, _ASIDE),
+                (stream, _sortable(number), _ASIDE),
             ):
                 limit_bytes -= len(encoded)
                 if chunks and limit_bytes < 0:
@@ -194,6 +193,11 @@ class Spool:
         """The server has everything of this stream up to this number."""
         where = f"state IN (?, ?) AND stream = ? AND position <= {_UP_TO}"
         self._change("UPDATE chunk SET state = ?", where, _STORED, _BARE, _WHOLE, stream, stream, _sortable(number))
+
+    def lost(self, stream: bytes, number: int | None) -> None:
+        """Of this stream the server has nothing above this number (None: nothing at all), whatever it said before."""
+        where = "state = ? AND stream = ? AND number > ?"  # _WHOLE without a body becomes _BARE where room is made
+        self._change("UPDATE chunk SET state = ?", where, _WHOLE, _STORED, stream, _sortable(number))
 
     def confirmed(self, stream: bytes, number: int) -> int:
         """This chunk and everything before it in the log leave the spool; what is set aside stays. Returns how many."""
@@ -223,5 +227,5 @@ class Spool:
         return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
 
 
-def _sortable(number: int) -> bytes:
-    return number.to_bytes(8, "big")
+def _sortable(number: int | None) -> bytes:
+    return b"" if number is None else number.to_bytes(8, "big")

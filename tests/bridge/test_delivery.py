@@ -224,6 +224,7 @@ def test_a_lost_inbox_is_filled_again_with_what_is_not_confirmed(tmp_path: Path)
     world.open_server()
     world.server_host.endpoint = world.server
     world.capture(10)
+    assert world.run(60, until=lambda: world.spool.statistics().unstored == 11), "all of it waits for the server again"
     assert world.run(300)
     assert world.stored_lines() == world.lines
 

@@ -191,6 +191,16 @@ def test_where_not_even_old_ones_make_room_it_says_so_changes_nothing_and_goes_o
     spool.close()
 
 
+def test_a_reserve_that_was_cut_short_is_none(tmp_path):
+    spool = open_spool(tmp_path / "spool.sqlite")
+    reserve = tmp_path / "spool.sqlite.reserve"
+    whole = reserve.stat().st_size
+    reserve.write_bytes(b"what a crash left")
+    spool.append(chunk(0))
+    assert reserve.stat().st_size == whole
+    spool.close()
+
+
 def test_a_crash_on_a_full_disk_leaves_what_was_there(disk, tmp_path):
     spool = open_spool(disk / "spool.sqlite")
     for one in chain(1000, size=8000):

@@ -106,6 +106,35 @@ def test_what_the_server_has_is_still_sent_to_one_that_lost_it(spool):
     assert spool.first_unconfirmed() == (STREAM, 0, made[0].header.digest)
 
 
+def test_what_the_server_lost_waits_for_it_again(spool):
+    made = fill(spool, 5)
+    spool.append(bare := dropped(chunk(5, previous=made[-1].header.digest)))
+    other = fill(spool, 1, stream=OTHER)
+    spool.stored(STREAM, 5)
+    spool.stored(OTHER, 0)
+    assert spool.statistics().unstored == 0
+    spool.lost(STREAM, 2)
+    assert spool.statistics().unstored == 3
+    spool.lost(STREAM, None)
+    assert (spool.statistics().unstored, spool.following(STREAM, None, PLENTY)) == (6, [*made, bare])
+    assert spool.following(OTHER, None, PLENTY) == other
+
+
+def test_what_the_server_lost_is_not_what_a_full_spool_gives_up_first(path):
+    spool = open_spool(path, 5300)
+    made = fill(spool, 4, size=1000)
+    spool.append(bare := dropped(chunk(4, size=1000)))
+    spool.stored(STREAM, 4)
+    spool.lost(STREAM, 1)
+    fill(spool, 3, stream=OTHER, size=1000)
+    assert spool.following(STREAM, None, PLENTY) == [*made[2:], bare]
+    assert spool.statistics()[-3:] == (0, 0, 0)
+    fill(spool, 1, stream=b"3" * 16, size=1000)
+    assert spool.following(STREAM, None, PLENTY) == [*map(dropped, made[2:]), bare]
+    assert spool.statistics()[-3:] == (2, 0, 10)
+    spool.close()
+
+
 def test_a_stream_that_is_gone_is_followed_by_the_oldest_there_is(spool):
     fill(spool, 2)
     spool.confirmed(STREAM, 1)
@@ -155,6 +184,16 @@ def test_then_what_was_set_aside_which_counts_as_dropped(path):
     statistics = spool.statistics()
     assert (statistics.aside, statistics.chunks) == (0, 4)
     assert (statistics.dropped_bodies, statistics.dropped_headers, statistics.dropped_records) == (1, 1, 5)
+    spool.close()
+
+
+def test_what_was_set_aside_without_its_body_is_not_counted_as_a_body_dropped_again(path):
+    spool = open_spool(path, 2000)
+    spool.append(dropped(chunk(0, size=1000)))
+    spool.append(chunk(1, size=0))  # of an hour without records
+    spool.set_aside(STREAM, 0)
+    fill(spool, 2, stream=OTHER, size=1000)
+    assert spool.statistics()[-3:] == (0, 2, 0)
     spool.close()
 
 
@@ -261,6 +300,16 @@ def test_a_look_makes_and_changes_nothing(path):
     assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
 
 
+def test_a_file_that_was_just_begun_has_nothing_to_look_at(path):
+    path.touch()  # as a robot leaves it that is killed at its very first step
+    with pytest.raises(NothingThere, match="there is no spool"):
+        open_spool(path, read_only=True)
+    sqlite3.connect(path).execute("PRAGMA journal_mode = WAL").connection.close()  # and at the next
+    with pytest.raises(NothingThere, match="there is no spool"):
+        open_spool(path, read_only=True)
+    open_spool(path).close()
+
+
 @pytest.mark.parametrize("log", [Log(LOG.ledger, b"x" * 32), Log(b"x" * 32, LOG.tk)])
 def test_the_spool_of_another_robot_or_contract_is_refused(path, spool, log):
     spool.close()
@@ -365,7 +414,8 @@ class Model(RuleBasedStateMachine):
                 self.rows.remove(stored[0])
             elif aside:
                 self.rows.remove(aside[0])
-                self.drops = [self.drops[0] + 1, self.drops[1] + 1, self.drops[2] + aside[0][0].header.records]
+                gone, body = aside[0][0], bool(aside[0][0].body)  # else it was counted when the body went
+                self.drops = [self.drops[0] + body, self.drops[1] + 1, self.drops[2] + body * gone.header.records]
             elif whole and held(bare) <= held(self.rows) // 8:
                 self.drops = [self.drops[0] + 1, self.drops[1], self.drops[2] + whole[0][0].header.records]
                 whole[0][0] = dropped(whole[0][0])
