@@ -210,7 +210,7 @@ class Client:
 
     def _ping_at(self, session: Session) -> float:
         often = 1 if self._expecting_since == NEVER else 3
-        return session.last_received + KEEP_ALIVE / often if session.idle else NEVER
+        return session.last_received + KEEP_ALIVE / often if session.waiting_since == NEVER else NEVER
 
     def _silent_at(self, session: Session) -> float:
         waiting_since = min(session.waiting_since, self._expecting_since)

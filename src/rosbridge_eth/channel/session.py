@@ -90,8 +90,6 @@ class Session:
         self.newest = False
         """The packet received last has the highest number so far."""
         self.last_received = now
-        self.waiting_since = NEVER
-        """Since when there has been something without an acknowledgement."""
         self.next_number = 0
         self.largest_acked = -1
         self.round_trip = RoundTrip(rtt)
@@ -241,8 +239,6 @@ class Session:
             self._window.acknowledged(size, rtt, largest, self.next_number, now)
             self._pto_count = self._probes = 0
             self._pto_base = now
-            if not flying:
-                self.waiting_since = NEVER
         self._find_lost(now)
 
     def _find_lost(self, now: float) -> None:
@@ -284,9 +280,9 @@ class Session:
         self._ping = True
 
     @property
-    def idle(self) -> bool:
-        """Nothing was sent that is not acknowledged."""
-        return not self._in_flight
+    def waiting_since(self) -> float:
+        """When the oldest packet was sent that may still be acknowledged; NEVER if there is none."""
+        return next(iter(self._in_flight.values())).at if self._in_flight else NEVER
 
     def _has_new(self) -> bool:
         return bool(self._unsent) and self._next_out < self._all_acked_below + RECEIVE_SEGMENTS
@@ -325,8 +321,6 @@ class Session:
 
     def _in_flight_add(self, size: int, index: int, now: float) -> None:
         size += wire.DATA_OVERHEAD
-        if not self._in_flight:
-            self.waiting_since = now
         self._in_flight[self.next_number] = SentPacket(now, size, index)
         self._in_flight_size += size
         self._window.sent(size)

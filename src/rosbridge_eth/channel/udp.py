@@ -47,8 +47,8 @@ def _open(family: int) -> socket.socket:
 def _resolve(host: str, port: int, flags: int = 0) -> tuple[int, Address]:
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags)
-    except socket.gaierror as error:
-        raise NetworkError(f"the address {host!r} cannot be found: {error.strerror}") from error
+    except (socket.gaierror, UnicodeError) as error:  # the latter for what cannot be a name
+        raise NetworkError(f"the address {host!r} cannot be found: {getattr(error, 'strerror', error)}") from error
     family, _, _, _, place = found[0]
     return family, (str(place[0]), int(place[1]))
 

@@ -7,6 +7,8 @@ import os
 import random
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
+from email.utils import formatdate
 from pathlib import Path
 from typing import Any
 
@@ -106,13 +108,40 @@ class Refusing(http.server.BaseHTTPRequestHandler):
     def log_message(self, format: str, *arguments: Any) -> None: ...
 
 
-@pytest.fixture
-def refusing() -> Iterator[str]:
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Refusing)
+class Empty(Refusing):
+    """An S3 with an object of no bytes, of which there is no range."""
+
+    def do_GET(self) -> None:
+        self.send_response(416 if "Range" in self.headers else 200)
+        for name, value in (("Content-Length", "0"), ("ETag", '"0"'), ("Last-Modified", formatdate(usegmt=True))):
+            self.send_header(name, value)
+        self.end_headers()
+
+
+@contextmanager
+def serving(handler: type[Refusing]) -> Iterator[str]:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
     server.server_close()
+
+
+@pytest.fixture
+def refusing() -> Iterator[str]:
+    with serving(Refusing) as url:
+        yield url
+
+
+def test_an_object_of_no_bytes_is_no_body_and_not_an_archive_that_is_away(tmp_path: Path) -> None:
+    with serving(Empty) as url:
+        (keys := tmp_path / "keys").write_text("id secret")
+        keys.chmod(0o600)
+        archive = open_archive(ArchiveConfig.model_validate({"url": "s3://robots", "endpoint": url, "keys": str(keys)}))
+        assert archive.get(DIGEST, 100) == b""
+    (tmp_path / DIGEST.hex()[:2]).mkdir()
+    (tmp_path / DIGEST.hex()[:2] / DIGEST.hex()).touch()
+    assert Folder(tmp_path).get(DIGEST, 100) == b""
 
 
 def test_a_store_that_refuses_or_is_away_is_an_error_without_the_secret(tmp_path: Path, refusing: str) -> None:

@@ -25,7 +25,7 @@ from rosbridge_eth.channel import (
     Mode,
     ServerConfig,
 )
-from rosbridge_eth.channel.session import RESERVED_SEGMENTS
+from rosbridge_eth.channel.session import NEVER, RESERVED_SEGMENTS
 from rosbridge_eth.channel.wire import SEGMENT_SIZE
 
 SEEDS = int(os.environ.get("CHANNEL_SEEDS", "100"))
@@ -103,7 +103,7 @@ def test_without_faults_nothing_is_sent_twice():
     [connection] = hub.server._connections.values()
     for session in (robot.client._session, connection.session):
         assert session.round_trip.smoothed == pytest.approx(0.02, rel=0.5)
-        assert session.idle and not session._unacked and not session._early and not session._unsent
+        assert session.waiting_since == NEVER and not session._unacked and not session._early and not session._unsent
 
 
 def test_reordering_within_an_eighth_of_the_round_trip_is_not_taken_for_loss():
@@ -241,7 +241,7 @@ def test_a_robot_that_waits_for_an_answer_alone_notices_silence_too():
     robot = RobotProgram(network, [b"one"])
     assert network.run(lambda: robot.sent == 1)
     network.run(lambda: False, limit=1.0)
-    assert robot.client._session.idle
+    assert robot.client._session.waiting_since == NEVER
     hub.restart()
     began = network.now
     assert network.run(lambda: robot.done, limit=60.0)

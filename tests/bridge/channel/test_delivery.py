@@ -11,14 +11,15 @@ from bridge.channel.steps import Steps, events
 from bridge.channel.world import make_client
 from rosbridge_eth.channel import ClientConfig, End
 from rosbridge_eth.channel.delivery import MAX_PTO
+from rosbridge_eth.channel.session import NEVER
 from rosbridge_eth.channel.wire import SEGMENT_SIZE, Ack, Frame
 
 
 class Line:
     """A client whose packets nobody gets; `acknowledge` says the contrary of some of them."""
 
-    def __init__(self) -> None:
-        patient = ClientConfig(patience=1000.0, patience_max=1000.0)
+    def __init__(self, patience: float = 1000.0) -> None:
+        patient = ClientConfig(patience=patience, patience_max=patience)
         self.steps = Steps(client=make_client(1000.0, patient)).until_connected()
         self.session = self.steps.client._session
         self.now = 1000.0
@@ -74,7 +75,7 @@ def test_a_packet_is_lost_when_a_later_one_is_acknowledged_and_nine_eighths_of_a
     again = line.pass_time(0.002)
     assert len(again) == 1 and line.counted == (1, 1)
     line.acknowledge(again, round_trip=0.1)
-    assert line.session.idle and not line.session._unsent
+    assert line.session.waiting_since == NEVER and not line.session._unsent
     line.acknowledge([a, b, c, *again])  # a late one, too, changes nothing
     assert line.counted == (1, 1)
 
@@ -112,7 +113,7 @@ def test_a_segment_is_not_sent_again_for_a_packet_whose_place_another_has_taken(
     assert line.flush() == []  # both packets of before are lost, but their segments are on their way already
     assert line.counted == (2, 2)
     line.acknowledge([*probes, later])
-    assert line.session.idle and line.counted == (2, 2)
+    assert line.session.waiting_since == NEVER and line.counted == (2, 2)
 
 
 def test_a_segment_that_arrived_is_not_sent_again_though_its_packets_acknowledgement_was_lost():
@@ -123,6 +124,15 @@ def test_a_segment_that_arrived_is_not_sent_again_though_its_packets_acknowledge
     assert line.session._unacked == {} and not line.session._unsent
     line.pass_time(1.0)
     assert line.counted[1] == 0
+
+
+def test_who_waits_for_nothing_any_more_does_not_find_its_peer_silent():
+    line = Line(patience=5.0)
+    line.send(100, 100)
+    [third] = line.send(100)
+    line.acknowledge([third], round_trip=0.1, next_segment=4)
+    line.pass_time(8.0)  # the first two packets are lost, and what was in them has arrived
+    assert line.session.waiting_since == NEVER and line.steps.client.state == "connected"
 
 
 def test_only_what_is_named_is_acknowledged():
@@ -163,7 +173,7 @@ def test_an_end_acknowledges_after_eight_packets_at_once_at_a_gap_and_else_after
     [connection] = steps.server._connections.values()
     steps.now += 0.03
     steps.to_server(*(data for data, _ in steps.client.datagrams_to_send(steps.now)))
-    assert connection.session.idle
+    assert connection.session.waiting_since == NEVER
     client, session = steps.client._session, connection.session
 
     def ping() -> list[bytes]:

@@ -164,9 +164,10 @@ def test_an_address_of_another_machine_is_an_error_with_its_own_way_out():
         server_sockets(("203.0.113.7", 0))
 
 
-def test_a_name_that_does_not_exist_is_an_error():
-    with pytest.raises(NetworkError, match=r"no-such-host\.invalid"):
-        client_socket(("no-such-host.invalid", 1))
+@pytest.mark.parametrize("name", ["no-such-host.invalid", "two..dots", "a" * 64 + ".example", "."])
+def test_a_name_that_does_not_exist_is_an_error(name):
+    with pytest.raises(NetworkError, match=f"the address {name!r} cannot be found"):
+        client_socket((name, 1))
 
 
 def test_nobody_at_the_other_end_is_not_an_error_of_the_socket():
