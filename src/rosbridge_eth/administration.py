@@ -27,16 +27,6 @@ from rosbridge_eth.config import Address, ServerConfig, load_server_config, pars
 from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import read_file, write_atomically
-from rosbridge_eth.home import (
-    Deployment,
-    HomeKind,
-    OperatorHome,
-    ReaderHome,
-    home_of,
-    make_home,
-    new_home,
-    require_empty,
-)  # fmt: skip
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
@@ -44,6 +34,10 @@ from rosbridge_eth.ledger.contract import BALANCE_LIMIT, WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.registry import OWNER, Registry
 from smcrypto import InvalidKey, sm2
+
+from rosbridge_eth.home import (  # isort: skip
+    BridgeEnd, Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, new_home, require_empty,
+)  # fmt: skip
 
 OPERATOR = "operator"  # what the treasury's account is called
 ACCOUNTS_TRIED = 1000
@@ -358,7 +352,8 @@ def register_robot(
         raise IdentityError("a robot is registered by its request, or under a password that seals the keys made here")
     if request and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
-    end = home.deployment().end(name, config.name, str(config.address_for_robots()))
+    there = home.deployment()
+    end = BridgeEnd(name, config.name, str(config.address_for_robots()), there.chain_id, there.genesis, there.contract)
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:

@@ -89,10 +89,6 @@ class Deployment:
         """What every signature of a log covers, 32 bytes (chunk.ledger_id)."""
         return ledger_of(self.chain_id, self.genesis, self.contract)
 
-    def end(self, robot: str, server_name: str, server_address: str) -> BridgeEnd:
-        """What a robot is told of it."""
-        return BridgeEnd(robot, server_name, server_address, self.chain_id, self.genesis, self.contract)
-
 
 @dataclass(frozen=True, slots=True)
 class BridgeEnd:

@@ -16,14 +16,13 @@ import numpy
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from rosbridge_eth.capture.conversion import NUMPY
+from rosbridge_eth.capture.conversion import BYTES, NUMPY
 from rosbridge_eth.capture.definitions import DURATION, HEADER, TIME, check_types, write_text
 from rosbridge_eth.capture.messages import Decoder, Wire
 from rosbridge_eth.errors import SourceError, VerificationError
 
 _SECOND: Final = 10**9
 _UINT32: Final = 2**32
-_BYTES: Final = frozenset({"uint8", "char", "byte"})
 NOT_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 
 Builder: TypeAlias = Callable[[Any, list[str]], Any]
@@ -110,7 +109,7 @@ class Restoration:
         return self._list(self._value(element, f"{path}[*]"), length, path)
 
     def _numbers(self, base: str, length: int | None, path: str) -> Builder:
-        kind, binary = numpy.dtype(NUMPY[base]), base in _BYTES
+        kind, binary = numpy.dtype(NUMPY[base]), base in BYTES
 
         def read(data: Any) -> Any:
             if binary:

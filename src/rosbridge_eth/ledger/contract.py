@@ -201,9 +201,9 @@ class Ledger:
                 f"{self.url} is another chain: id {here[0]} and first block {here[1].hex()}, "
                 f"not {right[0]} and {right[1].hex()}; name a node of the chain that was set up"
             )
-        if not self.code:
+        if not (code := self.code):
             raise ChainError(f"there is no contract at {self.contract} on {self.url}; the node may be behind")
-        if self.code.hex() != artifact()["deployedBytecode"]:
+        if code.hex() != artifact()["deployedBytecode"]:
             raise ChainError(f"the contract at {self.contract} on {self.url} is not RobotLedger of this edition")
         self._checked = True
 
@@ -363,7 +363,7 @@ class Ledger:
         found: list[RegistrationEvent] = []
         block = standing.changed_block
         while block > 0:
-            page = self._events({"Registered": _registered, "Revoked": _revoked}, tk, block, block)
+            page = self._events({"Registered": _registration, "Revoked": _registration}, tk, block, block)
             if not page or page[0].previous_block >= block:
                 raise ChainError(f"{self.url} has no registration of this robot in block {block}, where one must be")
             found = page + found
@@ -418,11 +418,11 @@ class Ledger:
         answers = self._node.many(asked, at_once=SENT_AT_ONCE)
         return [answer if isinstance(answer, ChainError) else None for answer in answers]
 
-    def call(self, account: str, data: bytes, *, value: int = 0, gas: int | None = None) -> None:
+    def call(self, account: str, data: bytes, *, gas: int, value: int = 0) -> None:
         """Try a transaction without sending it; Reverted with the contract's error if it would fail."""
-        transaction: Any = {"from": account, "to": self.contract, "data": "0x" + data.hex(), "value": value}
+        fields: Any = {"from": account, "to": self.contract, "data": "0x" + data.hex(), "value": value, "gas": gas}
         with self._node.asking():
-            self._w3.eth.call(transaction | ({} if gas is None else {"gas": gas}))
+            self._w3.eth.call(fields)
 
     def receipt(self, transaction: bytes) -> Receipt | None:
         """The outcome of a transaction that is in a block."""
@@ -518,12 +518,8 @@ def _data_event(args: Any, log: Any) -> DataEvent:
     )  # fmt: skip
 
 
-def _registered(args: Any, log: Any, *, revoked: bool = False) -> RegistrationEvent:
+def _registration(args: Any, log: Any) -> RegistrationEvent:
     return RegistrationEvent(
         args["account"], args.get("certificates", b""), natural(args["index"]), natural(args["previousBlock"]),
-        log["blockNumber"], revoked,
+        log["blockNumber"], revoked="certificates" not in args,
     )  # fmt: skip
-
-
-def _revoked(args: Any, log: Any) -> RegistrationEvent:
-    return _registered(args, log, revoked=True)

@@ -368,7 +368,7 @@ class Submitter:
             if batch.gas > room - sum(other.gas for other in new):
                 break
             if account.careful:
-                self._try(work.tk, account, batch, now)
+                self._try(work, account, batch, now)
             used = contract.set_data_cost([row.size for row in batch.rows])
             if not self._affords(account, used, now):
                 account.hold = "it used the gas of its day (gas_per_day); more comes by the hour"
@@ -380,13 +380,12 @@ class Submitter:
         self.counts["sent"] += len(new)
         return new
 
-    def _try(self, tk: bytes, account: Account, batch: Batch, now: float) -> None:
+    def _try(self, work: Work, account: Account, batch: Batch, now: float) -> None:
         """_Hold if the contract would refuse it; asked again every PATIENCE."""
         if account.hold is not None and not account.due(now):
             raise _Hold(account.hold)
-        key = self._account(tk)
         try:
-            self._ledger.call(key.address if key else "", self._calldata(tk, batch), gas=batch.gas)
+            self._ledger.call(work.standing.account or "", self._calldata(work.tk, batch), gas=batch.gas)
         except Reverted as error:
             account.since = now
             raise _Hold(str(error)) from error

@@ -17,9 +17,7 @@ from rosbridge_eth.sources.sim import SimSource
 
 __all__ = ["BagSource", "Clock", "Emit", "Offer", "Selection", "SimSource", "Source", "open_source", "sample_bag"]
 
-_KINDS: dict[str, Callable[..., Source]] = {
-    "bag": BagSource, "ros1": Ros1Source, "ros2": Ros2Source, "sim": SimSource,
-}  # fmt: skip
+_KINDS: dict[str, Callable[..., Source]] = {"bag": BagSource, "ros1": Ros1Source, "ros2": Ros2Source, "sim": SimSource}
 
 
 def open_source(table: AnySource, selection: Selection) -> Source:

@@ -103,7 +103,7 @@ def test_what_is_no_answer_is_said_in_one_line(body: bytes):
         for ask in (
             asked.block, asked.block_number, lambda: asked.standings([TK]), lambda: asked.nonces([CONTRACT]),
             lambda: list(asked.data_events(TK, 0, 10)), lambda: asked.balance(CONTRACT), lambda: asked.receipt(TK),
-            asked.check, lambda: asked.call(CONTRACT, b"", value=0),
+            asked.check, lambda: asked.call(CONTRACT, b"", gas=1),
         ):  # fmt: skip
             try:
                 ask()

@@ -228,6 +228,7 @@ class Ros1Source(LiveSource):
                     known[uri].kept = False
                 elif len(self._publishers) >= MAX_CONNECTIONS:
                     self._say("room", f"more than {MAX_CONNECTIONS} publishers; some of {name} are left out")
+                    topic.rung, topic.not_before = True, time.monotonic() + LAST_RETRY
                     break
                 else:
                     publisher = known[uri] = Publisher(self, name, uri)

@@ -44,12 +44,10 @@ def import_rclpy() -> Any:
         except ModuleNotFoundError:  # before Iron
             events = import_module("rclpy.qos_event")
         return SimpleNamespace(
-            Context=import_module("rclpy.context").Context,
-            Node=import_module("rclpy.node").Node,
+            Context=import_module("rclpy.context").Context, Node=import_module("rclpy.node").Node, qos=qos,
             SingleThreadedExecutor=import_module("rclpy.executors").SingleThreadedExecutor,
-            qos=qos,
             SubscriptionEventCallbacks=events.SubscriptionEventCallbacks,
-        )
+        )  # fmt: skip
     except ModuleNotFoundError as error:
         if error.name == "rclpy":
             raise SourceError(f"a ROS 2 source needs rclpy, which this Python does not have; {GET_RCLPY}") from None

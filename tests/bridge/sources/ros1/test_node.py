@@ -233,6 +233,20 @@ def test_a_refused_topic_does_not_keep_the_others_waiting(make, caplog):
     assert "does not take a subscription to /a: not you" in caplog.text
 
 
+def test_publishers_that_were_left_out_are_read_when_there_is_room(make, begun, monkeypatch):
+    monkeypatch.setattr(source, "MAX_CONNECTIONS", 1)
+    monkeypatch.setattr(source, "LAST_RETRY", 0.0)
+    script = make("/a", "/b")
+    script.publishers = {"/a": ["http://x:1/"], "/b": ["http://y:1/"]}
+    script.turn()
+    assert (connected(script, "/a"), connected(script, "/b")) == (["http://x:1/"], [])
+    del script.publishers["/a"]
+    script.turn()
+    script.subject.gone(begun[0])
+    script.turn()
+    assert (connected(script, "/a"), connected(script, "/b")) == ([], ["http://y:1/"])
+
+
 def test_connections_and_topics_are_limited(make, begun, monkeypatch, caplog):
     monkeypatch.setattr(source, "MAX_CONNECTIONS", 50)
     monkeypatch.setattr(source, "MAX_TOPICS", 20)
