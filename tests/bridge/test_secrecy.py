@@ -108,7 +108,6 @@ class Seen:
         found = {f"passphrase {number}": text.encode() for number, text in enumerate(self.passphrases)}
         found |= {f"session secret {number}": key for number, key in enumerate(self.session_keys)}
         found |= {f"account {number}": bytes(ring.account(number).key) for number in range(2)}
-        assert ring.mnemonic is not None
         found["mnemonic"] = ring.mnemonic.encode()
         for who, folder, word in (
             ("server", operator / "server", passphrase), ("robot", self.folder / "robot" / "identity", password),

@@ -369,10 +369,7 @@ def export(
 
 def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
     """Print the words from which all accounts can be restored (`init --mnemonic-file`). Keep them offline."""
-    words = _opened(home, passphrase_file)[2].mnemonic
-    if words is None:
-        raise IdentityError("the accounts of this home come from a seed, not from words")
-    typer.echo(words)
+    typer.echo(_opened(home, passphrase_file)[2].mnemonic)
 
 
 def handover(

@@ -1,13 +1,11 @@
-"""The Ethereum accounts of an operator and its robots: one seed, one passphrase.
+"""The Ethereum accounts of an operator and its robots: one mnemonic, one passphrase.
 
-Accounts are those of BIP-44, m/44'/60'/0'/0/N, from a BIP-39 mnemonic or a raw
-seed: number 0 is the operator's, number n that of the n-th enrolment. A wallet
-given the mnemonic shows the same ones, so whoever wrote the words down needs no
-copy of the file.
+Accounts are those of BIP-44, m/44'/60'/0'/0/N, from a BIP-39 mnemonic: number 0
+is the operator's, number n that of the n-th enrolment. A wallet given the words
+shows the same ones, so whoever wrote them down needs no copy of the file.
 
-At rest the seed is in a sealed box (files.py), whose key is worked out once, however many robots there are;
-the operator's address is shown in the clear. What is sealed is `kind`, a NUL, and the mnemonic in UTF-8 or
-the seed's bytes.
+At rest the words are in a sealed box (files.py), whose key is worked out once, however many robots there are;
+the operator's address is shown in the clear. What is sealed is "mnemonic", a NUL, and the words in UTF-8.
 """
 
 from __future__ import annotations
@@ -26,8 +24,7 @@ if TYPE_CHECKING:
 
 FORMAT = "rosbridge-eth accounts 2"
 WORDS = 24
-MIN_SEED, MAX_SEED = 16, 64  # bytes, BIP-32
-_MNEMONIC, _RAW = b"mnemonic", b"raw"
+_KIND = b"mnemonic\0"
 
 
 def _derivation() -> ModuleType:
@@ -39,11 +36,10 @@ def _derivation() -> ModuleType:
 
 
 class Keyring:
-    """All accounts of one operator. Made by `create`, `from_mnemonic`, `from_seed` or `open`."""
+    """All accounts of one operator. Made by `create`, `from_mnemonic` or `open`. mnemonic: the words, a secret."""
 
-    def __init__(self, kind: bytes, secret: bytes) -> None:
-        self._kind = kind
-        self._secret = secret
+    def __init__(self, mnemonic: str) -> None:
+        self.mnemonic = mnemonic
         self._accounts: dict[int, LocalAccount] = {}
 
     def __repr__(self) -> str:
@@ -54,7 +50,7 @@ class Keyring:
         """A new mnemonic of 24 words from the system's generator."""
         from eth_account.types import Language
 
-        return Keyring(_MNEMONIC, _derivation().generate_mnemonic(WORDS, Language.ENGLISH).encode())
+        return Keyring(_derivation().generate_mnemonic(WORDS, Language.ENGLISH))
 
     @staticmethod
     def from_mnemonic(words: str) -> Keyring:
@@ -66,25 +62,11 @@ class Keyring:
             derivation.key_from_seed(derivation.seed_from_mnemonic(normal, ""), derivation.ETHEREUM_DEFAULT_PATH)
         except (ValidationError, ValueError):
             raise IdentityError("this is no BIP-39 mnemonic: a word is unknown or the checksum wrong") from None
-        return Keyring(_MNEMONIC, normal.encode())
-
-    @staticmethod
-    def from_seed(seed: bytes) -> Keyring:
-        """A BIP-32 seed of 16 to 64 bytes."""
-        if not MIN_SEED <= len(seed) <= MAX_SEED:
-            raise IdentityError(f"a seed has {MIN_SEED} to {MAX_SEED} bytes, not {len(seed)}")
-        return Keyring(_RAW, bytes(seed))
-
-    @property
-    def mnemonic(self) -> str | None:
-        """The words to write down, None for a raw seed. A secret."""
-        return self._secret.decode() if self._kind == _MNEMONIC else None
+        return Keyring(normal)
 
     @cached_property
     def _seed(self) -> bytes:
-        if self._kind == _RAW:
-            return self._secret
-        seed: bytes = _derivation().seed_from_mnemonic(self._secret.decode(), "")
+        seed: bytes = _derivation().seed_from_mnemonic(self.mnemonic, "")
         return seed
 
     def account(self, number: int) -> LocalAccount:
@@ -122,13 +104,12 @@ class Keyring:
     def seal(self, passphrase: bytes, *, n: int = STRONG_SCRYPT_N) -> bytes:
         """The file that `open` reads; `n` is scrypt's cost."""
         head = {"format": FORMAT, "operator": self.operator.address}
-        return seal_box(self._kind + b"\0" + self._secret, passphrase, head, n=n)
+        return seal_box(_KIND + self.mnemonic.encode(), passphrase, head, n=n)
 
     @staticmethod
     def open(content: bytes, passphrase: bytes) -> Keyring:
         """The keyring of a sealed file; IdentityError if the passphrase or the file is wrong."""
-        kind, _, secret = open_box(content, passphrase, FORMAT)[1].partition(b"\0")
-        return Keyring(kind, secret)
+        return Keyring(open_box(content, passphrase, FORMAT)[1].removeprefix(_KIND).decode())
 
     def save(self, path: Path, passphrase: bytes, *, n: int = STRONG_SCRYPT_N) -> None:
         """Write the sealed file, readable by its owner alone, all of it or nothing. Never over another one."""

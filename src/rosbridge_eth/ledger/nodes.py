@@ -37,9 +37,7 @@ class EmbeddedChain(EthereumTesterProvider):
     Every transaction gets a block at once. Safe to use from several threads.
     """
 
-    def __init__(
-        self, fund: Mapping[str, int] | None = None, *, gas_limit: int = 30_000_000, rules: Any = None
-    ) -> None:
+    def __init__(self, fund: Mapping[str, int] | None = None, *, rules: Any = None) -> None:
         """fund: wei of these accounts at the beginning. rules: a VM class of py-evm, Prague's otherwise."""
         from eth_tester import EthereumTester, PyEVMBackend  # type: ignore[import-untyped, unused-ignore]
         from eth_utils.address import to_canonical_address
@@ -49,7 +47,7 @@ class EmbeddedChain(EthereumTesterProvider):
             to_canonical_address(account): {"balance": wei, "nonce": 0, "code": b"", "storage": {}}
             for account, wei in wealth.items()
         }
-        genesis = PyEVMBackend.generate_genesis_params({"gas_limit": gas_limit})
+        genesis = PyEVMBackend.generate_genesis_params({"gas_limit": 30_000_000})
         backend = PyEVMBackend(genesis, state, rules and ((0, rules),))
         super().__init__(EthereumTester(backend))
         limit_recursion()  # py-evm wants more for calls within calls 1,024 deep; the contract here makes none
@@ -127,14 +125,12 @@ class Anvil:
 
     @staticmethod
     def start(
-        port: int, *, state: Path | None = None, block_time: float | None = None, log_file: Path | None = None,
-        options: Sequence[str] = (),
-    ) -> Anvil:  # fmt: skip
+        port: int, *, state: Path | None = None, block_time: float | None = None, options: Sequence[str] = ()
+    ) -> Anvil:
         """Start anvil on 127.0.0.1:port and wait until it answers; npx fetches it the first time.
 
         state: the file that keeps the chain. block_time: seconds between blocks; without it every transaction gets
-        its block at once. log_file: where its output goes (nowhere otherwise). ChainError if it is missing or does
-        not start, or the port is taken.
+        its block at once. ChainError if it is missing or does not start, or the port is taken.
         """
         if not is_free(port):  # whatever listens there would answer in anvil's place
             raise ChainError(f"port {port} of 127.0.0.1 is in use; choose another")
@@ -152,11 +148,10 @@ class Anvil:
             command += ["--load-state", str(state)]
         if block_time is not None:
             command += ["--block-time", f"{block_time:g}"]
-        with (log_file.open("ab") if log_file else open(os.devnull, "wb")) as output:
-            process = subprocess.Popen(  # noqa: S603 - fixed programs
-                ["/bin/sh", "-c", _WITH_US, "sh", *command], stdin=subprocess.PIPE, stdout=output,
-                stderr=subprocess.STDOUT, start_new_session=True,
-            )  # fmt: skip
+        process = subprocess.Popen(  # noqa: S603 - fixed programs
+            ["/bin/sh", "-c", _WITH_US, "sh", *command], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
         anvil = Anvil(port, process, state)
         deadline = time.monotonic() + START_SECONDS
         while True:

@@ -101,7 +101,6 @@ def test_a_home_is_complete_or_none(world: World, tmp_path: Path, monkeypatch: p
 
 def test_the_seed_of_a_mnemonic_and_a_passphrase_file_are_taken(tmp_path: Path) -> None:
     words = Keyring.create().mnemonic
-    assert words is not None
     home, file = OperatorHome(tmp_path / "home"), tmp_path / "pass"
     file.write_bytes(PASSPHRASE)
     made = admin.init_home(
