@@ -79,7 +79,7 @@ def carried(size: int, count: int) -> tuple[float, float]:
         now += 0.005
         began = clock()
         client.handle_timer(now)
-        while sent < count and client.writable(now, size):
+        while sent < count and client.writable(size):
             client.send(payload)
             sent += 1
         up = client.datagrams_to_send(now)
@@ -135,7 +135,7 @@ def loopback(megabytes: float) -> None:
     payload, sent = os.urandom(CHUNK), 0
     began, worked = time.perf_counter(), time.process_time()
     while answered < count:
-        while sent < count and client.writable(time.monotonic(), CHUNK):
+        while sent < count and client.writable(CHUNK):
             client.send(payload)
             sent += 1
         loop.step(0.5)

@@ -149,7 +149,7 @@ def stage_costs(
     def exchange(watch: Stopwatch) -> None:
         now = time.monotonic()
         with watch("robot: send"):
-            sender.send(now)
+            sender.send()
             client.handle_timer(now)
             sent = client.datagrams_to_send(now)
         with watch("server: receive and open"):

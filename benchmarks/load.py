@@ -451,7 +451,7 @@ class Session:
         client.handle_timer(now)
         while (event := client.next_event()) is not None:
             self.sender.handle(event, now)
-        self.sender.send(now)
+        self.sender.send()
         for data, place in client.datagrams_to_send(now):
             self.sock.sendto(data, place)
         return client.next_timer() or now + 1

@@ -162,7 +162,8 @@ class Ring:
         """Keep it, and no longer what it leaves no time or room for."""
         self._records.append(record)
         self.bytes += self._size(record, +1)
-        self._forget(record.received_ns - self._length)
+        while self._records and self._records[0].received_ns < record.received_ns - self._length:
+            self._pop()
         while self.bytes > self._memory:
             gone = self._pop()
             second = gone.received_ns // SECOND
@@ -183,10 +184,6 @@ class Ring:
         self._early.clear()
         self.bytes = 0
         return records, early
-
-    def _forget(self, since_ns: int) -> None:
-        while self._records and self._records[0].received_ns < since_ns:
-            self._pop()
 
     def _pop(self) -> Record:
         record = self._records.popleft()

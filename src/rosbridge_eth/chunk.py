@@ -427,11 +427,6 @@ def proofs(lines: Sequence[bytes], key: bytes, indexes: Iterable[int]) -> Iterat
         yield Proof(index, next(_salts(key, [index])), path)
 
 
-def prove(lines: Sequence[bytes], key: bytes, index: int) -> Proof:
-    """The proof of one of them."""
-    return next(proofs(lines, key, [index]))
-
-
 def check_proof(root: bytes, records: int, line: bytes, proof: Proof) -> None:
     """Return if `line` is record `proof.index` of the chunk with this root and number of records; else Altered.
 

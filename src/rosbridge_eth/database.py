@@ -113,17 +113,13 @@ class Database:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA wal_autocheckpoint = {self._wal_pages}")
             if self._exclusive:
-                self._check()
+                self.check()
 
     def check(self) -> None:
         """StoreError if the file is damaged; reads all of it."""
         with self.errors(opening=True):
-            self._check()
-
-    def _check(self) -> None:
-        health = self.one("PRAGMA quick_check(1)")[0]
-        if health != "ok":
-            raise sqlite3.DatabaseError(health)
+            if (health := self.one("PRAGMA quick_check(1)")[0]) != "ok":
+                raise sqlite3.DatabaseError(health)
 
     def replaced(self) -> bool:
         """Whether the path leads to another file by now, or to none."""

@@ -152,7 +152,7 @@ class Robot:
                     self._finish(now)
                 else:
                     self._spool_chunks([] if finished else self.writer.closed(now, time.time_ns() // 10**6), now)
-                self._spool_or(None, partial(self.sender.send, now))
+                self._spool_or(None, self.sender.send)
                 on_turn()
                 if finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
                     break
@@ -285,7 +285,7 @@ class Robot:
             if (now := time.monotonic()) >= deadline:
                 break
             self._spool_chunks([], now)
-            self._spool_or(None, partial(self.sender.send, now))
+            self._spool_or(None, self.sender.send)
             self.loop.step(0.02)
 
     def handle(self, event: Event) -> None:

@@ -90,55 +90,52 @@ class Sender:
         """The server has all that the spool has."""
         return self._spool.statistics().unstored == 0
 
-    def send(self, now: float) -> None:
+    def send(self) -> None:
         """Send as much as the session takes."""
         if not self.statistics.connected or self._asked:
             return
         if self._stream is None:
-            self._ask(self._spool.first_unconfirmed(), now)
+            self._ask(self._spool.first_unconfirmed())
             return
-        if not self._client.writable(now) or not self._send_parts(now) or sum(self._flying.values()) > AHEAD:
+        if not self._client.writable() or not self._send_parts() or sum(self._flying.values()) > AHEAD:
             return
         for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
             encoded, number = chunk.encoded, chunk.header.number
             if len(encoded) > MAX_CHUNK:
                 self._parts = memoryview(encoded), self._have.size if chunk.header.digest == self._have.digest else 0
-            elif not self._put(Offer(encoded), now):
+            elif not self._put(Offer(encoded)):
                 return
             self._sent, self._flying[number] = number, len(encoded)
             self.statistics.sent += 1
-            if not self._send_parts(now):
+            if not self._send_parts():
                 return
         if self._sent == self._stored:
-            self._ask(self._spool.next_stream(self._stream), now)
+            self._ask(self._spool.next_stream(self._stream))
 
-    def _send_parts(self, now: float) -> bool:
+    def _send_parts(self) -> bool:
         """Send what is left of a chunk that goes in parts; whether nothing is."""
         while self._parts is not None:
             encoded, at = self._parts
             end = min(at + MAX_PART, len(encoded))
-            if not self._put(Part(at, len(encoded), encoded[at:end]), now):
+            if not self._put(Part(at, len(encoded), encoded[at:end])):
                 return False
             self._parts = None if end == len(encoded) else (encoded, end)
         return True
 
-    def _put(self, message: Offer | Part, now: float) -> bool:
+    def _put(self, message: protocol.Up) -> bool:
         """Send it, if there is room."""
         encoded = protocol.encode(message)
-        if not self._client.writable(now, len(encoded)):
+        if not self._client.writable(len(encoded)):
             return False
         self._client.send(encoded)
         self._client.expecting(True)
         return True
 
-    def _ask(self, place: tuple[bytes, int, bytes] | None, now: float) -> None:
-        question = None if place is None else protocol.encode(Where(*place))
-        if place is not None and question is not None and self._client.writable(now, len(question)):
-            self._client.send(question)
+    def _ask(self, place: tuple[bytes, int, bytes] | None) -> None:
+        if place is not None and self._put(Where(*place)):
             self._stream, self._sent, self._stored, self._asked = place[0], None, None, True
             self._parts, self._have = None, Have(b"", 0)
             self._flying.clear()
-            self._client.expecting(True)
 
     def handle(self, event: Event, now: float) -> None:
         """Take one event of the client. Raises NetworkError where the server says what is no message of ours."""

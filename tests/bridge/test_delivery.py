@@ -125,7 +125,7 @@ class World:
     def turn(self) -> None:
         """What both processes do between two waits."""
         self.reception.turn(self.network.now, self.network.now)
-        self.sender.send(self.network.now)
+        self.sender.send()
 
     def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
         """Until the server has all there is, or `until`; False if that takes more than so many simulated seconds."""

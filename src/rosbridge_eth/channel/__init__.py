@@ -6,19 +6,10 @@ sockets under them.
 
 from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.client import Client
-from rosbridge_eth.channel.events import (
-    ClientConfig,
-    Connected,
-    Disconnected,
-    Drop,
-    End,
-    Event,
-    Full,
-    HandshakeFailed,
-    Message,
-    NotConnected,
-    ServerConfig,
-)
+
+from rosbridge_eth.channel.events import (  # isort: skip
+    ClientConfig, Connected, Disconnected, Drop, End, Event, Full, HandshakeFailed, Message, NotConnected, ServerConfig,
+)  # fmt: skip
 from rosbridge_eth.channel.handshake import Randomness
 from rosbridge_eth.channel.server import Server, cookie_key
 from rosbridge_eth.channel.wire import Mode, Reason

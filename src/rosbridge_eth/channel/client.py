@@ -102,7 +102,7 @@ class Client:
         self._address = address
         self._greet(now)
 
-    def writable(self, now: float, size: int = MAX_MESSAGE) -> bool:
+    def writable(self, size: int = MAX_MESSAGE) -> bool:
         """Whether `send` takes a message of `size` bytes at this moment."""
         return self.state is State.CONNECTED and self._session is not None and self._session.has_room(size)
 

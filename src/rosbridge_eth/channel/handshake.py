@@ -82,10 +82,6 @@ def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
     return sm3.SM3(b"rosbridge-eth/2 handshake\0" + version_and_mode + hello.client_cid + hello.nonce + cookie)
 
 
-def _digest(transcript: sm3.SM3) -> bytes:
-    return transcript.copy().digest()
-
-
 def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], list[int]]:
     """Fields of these lengths, None for any, and their offsets."""
     try:
@@ -122,7 +118,7 @@ class ClientHandshake:
         self._transcript = transcript = _transcript(self.hello, cookie)
         unsigned = wire.fields([identity.signing_certificate.to_der(), identity.encryption_certificate.to_der(), point])
         transcript.update(unsigned)
-        signature = wire.fields([ids.sign(identity.signing_key, "handshake", b"client" + _digest(transcript))])
+        signature = wire.fields([ids.sign(identity.signing_key, "handshake", b"client" + transcript.digest())])
         transcript.update(signature)
         return unsigned + signature
 
@@ -138,7 +134,7 @@ class ClientHandshake:
         transcript = self._transcript.copy()
         transcript.update(body[: offsets[5]])
         try:
-            ids.verify(peer.signing_certificate.public_key, "handshake", b"server" + _digest(transcript), signature)
+            ids.verify(peer.signing_certificate.public_key, "handshake", b"server" + transcript.digest(), signature)
             transcript.update(body[offsets[5] : offsets[7]])
             if self._ephemeral is not None:
                 exchange = _exchange(self._identity, peer, self._ephemeral, initiator=True)
@@ -150,11 +146,11 @@ class ClientHandshake:
             raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold") from error
         if len(shared) != SHARED_SIZE:
             raise HandshakeRefused(Drop.MALFORMED, "the secret has another length")
-        keys = SessionSecrets(shared, _digest(transcript), self.hello.mode)
-        if not hmac.compare_digest(mac, finished(keys.server_finished, _digest(transcript))):
+        keys = SessionSecrets(shared, transcript.digest(), self.hello.mode)
+        if not hmac.compare_digest(mac, finished(keys.server_finished, transcript.digest())):
             raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold")
         transcript.update(body[offsets[7] :])
-        return Agreed(peer, keys, server_cid, own + finished(keys.client_finished, _digest(transcript)))
+        return Agreed(peer, keys, server_cid, own + finished(keys.client_finished, transcript.digest()))
 
 
 class ServerHandshake:
@@ -181,7 +177,7 @@ class ServerHandshake:
         self._exchange: sm2.KeyExchange | None = None
         try:
             signer = self.peer.signing_certificate.public_key
-            ids.verify(signer, "handshake", b"client" + _digest(transcript), signature)
+            ids.verify(signer, "handshake", b"client" + transcript.digest(), signature)
             transcript.update(body[offsets[3] :])
             if exchange:
                 self._exchange = _exchange(identity, self.peer, randomness.private_key(), initiator=False)
@@ -195,13 +191,13 @@ class ServerHandshake:
         mine = (identity.signing_certificate.to_der(), identity.encryption_certificate.to_der())
         unsigned = wire.fields([randomness.bytes(wire.NONCE_SIZE), server_cid, *mine, material])
         transcript.update(unsigned)
-        signature = ids.sign(identity.signing_key, "handshake", b"server" + _digest(transcript))
+        signature = ids.sign(identity.signing_key, "handshake", b"server" + transcript.digest())
         signed = wire.fields([signature, confirmation])
         transcript.update(signed)
-        self.secrets = SessionSecrets(shared, _digest(transcript), hello.mode)
-        last = wire.fields([finished(self.secrets.server_finished, _digest(transcript))])
+        self.secrets = SessionSecrets(shared, transcript.digest(), hello.mode)
+        last = wire.fields([finished(self.secrets.server_finished, transcript.digest())])
         transcript.update(last)
-        self._finished = finished(self.secrets.client_finished, _digest(transcript))
+        self._finished = finished(self.secrets.client_finished, transcript.digest())
         self.offer = unsigned + signed + last
 
     def confirm(self, finished: bytes) -> None:

@@ -84,14 +84,11 @@ def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
     except OSError as error:
         for sock in sockets:
             sock.close()
-        mend = "stop the program that has it, or choose another port"
-        if error.errno == errno.EADDRNOTAVAIL:
-            mend = "no network interface here has that address; listen at one of them, or at 0.0.0.0 for all"
-        elif error.errno == errno.EACCES:
-            mend = "choose a port from 1024 on, or run with the right to open it"
-        raise NetworkError(
-            f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; {mend}"
-        ) from error
+        mend = {
+            errno.EADDRNOTAVAIL: "no interface here has that address; listen at one of them, or at 0.0.0.0 for all",
+            errno.EACCES: "choose a port from 1024 on, or run with the right to open it",
+        }.get(error.errno or 0, "stop the program that has it, or choose another port")
+        raise NetworkError(f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; {mend}") from error
     if workers > 1 and sys.platform.startswith("linux"):
         _steer(sockets[0], workers)
     return sockets

@@ -123,7 +123,7 @@ class Archiving(World):
 
     def part(self, chunk: bytes, at: int, size: int = 60_000) -> None:
         message = protocol.encode(protocol.Part(at, len(chunk), chunk[at : at + size]))
-        while not self.client.writable(self.network.now, len(message)):
+        while not self.client.writable(len(message)):
             self.network.at(self.network.now + 0.05, lambda: None)
             self.network.step()
         self.client.send(message)

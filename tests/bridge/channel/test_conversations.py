@@ -425,5 +425,5 @@ def test_a_sender_is_told_to_wait_and_holds_no_more_than_it_may(monkeypatch):
     robot.messages = [bytes(9996)] * 50
     robot.feed()
     assert 8 <= robot.sent <= 9
-    assert not robot.client.writable(network.now) and robot.client.writable(network.now, 1)
+    assert not robot.client.writable() and robot.client.writable(1)
     assert network.run(lambda: robot.done)

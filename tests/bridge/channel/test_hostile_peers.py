@@ -205,7 +205,7 @@ def test_an_end_takes_no_more_than_its_session_has_room_for(monkeypatch):
     monkeypatch.setattr("rosbridge_eth.channel.session.MAX_BUFFERED", 80_000)
     steps = Steps().until_connected()
     steps.client.send(bytes(70_000))
-    assert not steps.client.writable(steps.now) and steps.client.writable(steps.now, 9_000)
+    assert not steps.client.writable() and steps.client.writable(9_000)
     with pytest.raises(Full):
         steps.client.send(bytes(10_000))
     with pytest.raises(ValueError, match="at most"):

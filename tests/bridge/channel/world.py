@@ -184,7 +184,7 @@ class RobotProgram:
         """Send what the session takes."""
         while self.sent is not None and self.sent < len(self.messages):
             payload = self.sent.to_bytes(4, "big") + self.messages[self.sent]
-            if not self.client.writable(self.network.now, len(payload)):
+            if not self.client.writable(len(payload)):
                 break
             self.client.send(payload)
             self.client.expecting(True)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rosbridge_eth import identity
-from rosbridge_eth.chunk import Chunk, Header, Log, ledger_id, prove, robot_id, seal
+from rosbridge_eth.chunk import Chunk, Header, Log, ledger_id, proofs, robot_id, seal
 from smcrypto import sm2, sm3, sm4
 
 LOG = Log(ledger_id(1337, b"g" * 32, b"c" * 20), robot_id("robot_1"))
@@ -58,7 +58,7 @@ def lying(frame: bytes, *, records: int = 1, root: bytes = b"r" * 32, pad: int |
 
 def root_of(lines: Sequence[bytes], key: bytes = b"k" * 16) -> bytes:
     """The root over these lines, by the proof of the first."""
-    proof = prove(lines, key, 0)
+    proof = next(proofs(lines, key, [0]))
     value = sm3.digest(b"\0" + proof.salt + lines[0])
     for sibling in proof.path:
         value = sm3.digest(b"\1" + value + sibling)

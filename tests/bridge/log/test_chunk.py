@@ -50,7 +50,7 @@ from rosbridge_eth.chunk import (
     drop,
     ledger_id,
     open_lines,
-    prove,
+    proofs,
     robot_id,
     signed_as,
     verify,
@@ -414,7 +414,7 @@ def test_an_archived_chunk_opens_as_any_other_and_goes_on_the_chain_without_its_
     assert chunk.on_chain == Chunk(chunk.header, chunk.signature, b"") and chunk.on_chain.bare
     assert Chunk.parse(chunk.on_chain.encoded) == chunk.on_chain
     assert CHUNK.on_chain is CHUNK and not CHUNK.header.archived
-    check_proof(chunk.header.root, len(LINES), LINES[2], prove(LINES, content_key(chunk.header, READER), 2))
+    check_proof(chunk.header.root, len(LINES), LINES[2], next(proofs(LINES, content_key(chunk.header, READER), [2])))
 
 
 def test_the_signature_tells_an_archived_chunk_from_a_dropped_one_and_nobody_makes_one_of_the_other():

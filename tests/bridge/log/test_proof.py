@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.log.making import LINES, READER, sealed
-from rosbridge_eth.chunk import MAX_RECORDS, Altered, Proof, check_proof, content_key, prove
+from rosbridge_eth.chunk import MAX_RECORDS, Altered, Proof, check_proof, content_key, proofs
 from smcrypto import sm3
 
 KEY = b"k" * 16
@@ -53,7 +53,7 @@ def test_every_record_of_every_small_chunk_is_proven_as_the_rfc_says(n):
     leaves = [leaf(i, line) for i, line in enumerate(lines)]
     root = tree_hash(leaves)
     for i, line in enumerate(lines):
-        proof = prove(lines, KEY, i)
+        proof = next(proofs(lines, KEY, [i]))
         assert proof == Proof(i, sm3.hmac(KEY, i.to_bytes(4, "big"))[:16], tuple(path(i, leaves)))
         check_proof(root, n, line, proof)
         for j in range(-1, n + 2) if n < 20 else ():
@@ -77,7 +77,7 @@ def test_a_proof_that_was_changed_shows_nothing(n, data):
     lines = [b"line %d" % i for i in range(n)]
     root = tree_hash([leaf(i, line) for i, line in enumerate(lines)])
     i = data.draw(st.integers(0, n - 1))
-    proof, line = prove(lines, KEY, i), lines[i]
+    proof, line = next(proofs(lines, KEY, [i])), lines[i]
     node, bit = data.draw(st.integers(0, len(proof.path))), data.draw(st.integers(0, 127))
 
     def flipped(value: bytes) -> bytes:
@@ -117,7 +117,7 @@ def test_a_place_that_is_none_is_refused(records, index):
     with pytest.raises(Altered):
         check_proof(leaf(0, b"a"), records, b"a", Proof(index, sm3.hmac(KEY, bytes(4))[:16], ()))
     with pytest.raises(ValueError, match="no record"):
-        prove([b"a"], KEY, 1)
+        next(proofs([b"a"], KEY, [1]))
 
 
 def test_a_long_path_costs_nothing():

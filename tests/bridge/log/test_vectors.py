@@ -29,7 +29,7 @@ from rosbridge_eth.chunk import (
     drop,
     ledger_id,
     open_lines,
-    prove,
+    proofs,
     robot_id,
     seal,
     verify,
@@ -184,7 +184,7 @@ def test_this_library_says_the_same(v):
         assert [tag for tag, _ in again.header.grants] == [tag for tag, _ in header.grants]
     if hasattr(v, "proof"):
         proof = Proof(v.proof.index, v.proof.salt, tuple(v.proof.path))
-        assert prove(v.lines, v.content_key, proof.index) == proof
+        assert next(proofs(v.lines, v.content_key, [proof.index])) == proof
         check_proof(header.root, header.records, v.lines[proof.index], proof)
     if hasattr(v, "dropped"):
         dropped = Chunk.parse(v.dropped.chunk)

@@ -25,7 +25,8 @@ from bridge.reading.world import NAME, START, Pen, authority, message, reader, r
 from conftest import unavailable
 from ports import free_port
 from rosbridge_eth.capture import parse_line
-from rosbridge_eth.chunk import Chunk, content_key, prove
+from rosbridge_eth.chunk import Chunk, content_key
+from rosbridge_eth.chunk import proofs as record_proofs
 from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ChainError, ConfigError, StoreError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
@@ -649,7 +650,7 @@ def test_lines_that_only_a_lying_robot_writes_are_refused_in_both_languages(node
     assert len(both(text, javascript).records) == 1
     key, texts = content_key(chunk.header, reader().encryption_key), [text.replace("\\ufffd", "\\ud800")]
     for n in range(1, len(lines)):
-        proof, value = prove(lines, key, n), json.loads(text)
+        proof, value = next(record_proofs(lines, key, [n])), json.loads(text)
         path = [each.hex() for each in proof.path]
         value["records"][0] |= {"record": n, "line": lines[n].decode(), "salt": proof.salt.hex(), "path": path}
         texts.append(json.dumps(value, separators=(",", ":")))

@@ -32,7 +32,7 @@ from bridge.reading.world import (
     standing,
 )
 from rosbridge_eth.capture.lines import parse_line
-from rosbridge_eth.chunk import Chunk, Log, check_proof, prove, robot_id
+from rosbridge_eth.chunk import Chunk, Log, check_proof, proofs, robot_id
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.reading.verdict import Kind
@@ -69,7 +69,7 @@ def test_an_honest_log_is_sound_and_its_records_come_in_order():
 def test_a_record_that_was_read_can_be_shown_to_a_third_party():
     [chunk] = read([Pen().write(message(1), message(2), message(3))]).chunks
     header = chunk.chunk.header
-    check_proof(header.root, header.records, chunk.lines[1], prove(chunk.lines, chunk.key, 1))
+    check_proof(header.root, header.records, chunk.lines[1], next(proofs(chunk.lines, chunk.key, [1])))
 
 
 def test_a_robot_that_wrote_nothing():

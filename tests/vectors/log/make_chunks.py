@@ -93,7 +93,7 @@ def make(
         "signature": chunk.signature.hex(), "chunk": chunk.encoded.hex(),
     }  # fmt: skip
     if prove is not None:
-        proof = chunks.prove(lines, key, prove)
+        proof = next(chunks.proofs(lines, key, [prove]))
         case["proof"] = {
             "index": proof.index, "salt": proof.salt.hex(), "path": [value.hex() for value in proof.path],
         }  # fmt: skip
