@@ -29,7 +29,6 @@ from urllib.parse import urlsplit
 
 import requests
 from requests.adapters import HTTPAdapter
-from urllib3.connectionpool import HTTPConnectionPool, HTTPSConnectionPool
 
 from rosbridge_eth.errors import ChainError, ConfigError
 
@@ -163,10 +162,13 @@ class _DeadlineMixin:
         return super().getresponse()  # type: ignore[misc]
 
 
-def _with_deadline(pool: type[Any]) -> type[Any]:
-    """A class of connection pools, with such connections."""
-    connection = type("Connection", (_DeadlineMixin, pool.ConnectionCls), {})
-    return type("Pool", (pool,), {"ConnectionCls": connection})
+def _set_deadline(manager: Any) -> None:
+    """The connections of these pools are such ones."""
+    pools = {}
+    for scheme, pool in manager.pool_classes_by_scheme.items():
+        connection = type("Connection", (_DeadlineMixin, pool.ConnectionCls), {})
+        pools[scheme] = type("Pool", (pool,), {"ConnectionCls": connection})
+    manager.pool_classes_by_scheme = pools
 
 
 class BoundedAdapter(HTTPAdapter):
@@ -178,9 +180,12 @@ class BoundedAdapter(HTTPAdapter):
 
     def init_poolmanager(self, *args: Any, **options: Any) -> None:
         super().init_poolmanager(*args, **options)
-        self.poolmanager.pool_classes_by_scheme = {
-            "http": _with_deadline(HTTPConnectionPool), "https": _with_deadline(HTTPSConnectionPool),
-        }  # fmt: skip
+        _set_deadline(self.poolmanager)
+
+    def proxy_manager_for(self, proxy: str, **options: Any) -> Any:
+        if proxy not in self.proxy_manager:
+            _set_deadline(super().proxy_manager_for(proxy, **options))
+        return self.proxy_manager[proxy]
 
     def send(self, request: Any, *args: Any, **options: Any) -> requests.Response:
         response = super().send(request, *args, **(options | {"stream": True}))

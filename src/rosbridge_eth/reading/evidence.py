@@ -25,7 +25,7 @@ from importlib import resources
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.chunk import Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id
@@ -35,7 +35,7 @@ from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import proofs as chain
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
 from rosbridge_eth.reading.verdict import Governing, grouped, printable, shown
-from rosbridge_eth.reading.verify import LAST_MOMENT, ProvenRecord, Verifier, is_signed
+from rosbridge_eth.reading.verify import LAST_MOMENT, ProvenRecord, Verifier
 from smcrypto import sm3, x509
 
 if TYPE_CHECKING:
@@ -54,22 +54,13 @@ _END: Final = "</script>"
 # The file
 
 
-def _from_hex(value: object) -> bytes:
-    if isinstance(value, bytes):
-        return value
-    if not isinstance(value, str) or not re.fullmatch(r"(?:[0-9a-f]{2})*", value):
-        raise ValueError("lower-case hexadecimal is expected")
-    return bytes.fromhex(value)
-
-
-Hex = Annotated[bytes, BeforeValidator(_from_hex), PlainSerializer(bytes.hex)]
-Hex32 = Annotated[Hex, Field(min_length=32, max_length=32)]
+Hex32 = Annotated[bytes, Field(min_length=32, max_length=32)]
 Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 class _Part(BaseModel):
     # A member too many shows when the file is written anew; pydantic's errors for a million of them fill the memory.
-    model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
+    model_config = ConfigDict(extra="ignore", strict=True, frozen=True, ser_json_bytes="hex", val_json_bytes="hex")
 
 
 class Record(_Part):
@@ -78,7 +69,7 @@ class Record(_Part):
     chunk: Count
     record: Count
     line: str
-    salt: Annotated[Hex, Field(min_length=16, max_length=16)]
+    salt: Annotated[bytes, Field(min_length=16, max_length=16)]
     path: Annotated[list[Hex32], Field(max_length=10)]
 
 
@@ -86,7 +77,7 @@ class Block(_Part):
     """A block's hash, its header in RLP, and the indices of its transactions whose receipts are shown."""
 
     hash: Hex32
-    header: Hex
+    header: bytes
     receipts: Annotated[list[Count], Field(max_length=MAX_CHOSEN)]
 
 
@@ -97,15 +88,15 @@ class Evidence(_Part):
     robot: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$")]
     chain_id: Count
     genesis: Hex32
-    contract: Annotated[Hex, Field(min_length=20, max_length=20)]
-    authorities: Annotated[list[Hex], Field(min_length=1, max_length=16)]
+    contract: Annotated[bytes, Field(min_length=20, max_length=20)]
+    authorities: Annotated[list[bytes], Field(min_length=1, max_length=16)]
     records: Annotated[list[Record], Field(min_length=1, max_length=MAX_CHOSEN)]
     blocks: Annotated[list[Block], Field(min_length=1, max_length=MAX_CHOSEN)]
-    nodes: Annotated[list[Hex], Field(max_length=10 * MAX_CHOSEN)]
+    nodes: Annotated[list[bytes], Field(max_length=10 * MAX_CHOSEN)]
 
     def encode(self) -> str:
         """The one form: ASCII without spaces, members as above; "<" is escaped, so that no page can end in it."""
-        return json.dumps(self.model_dump(), separators=(",", ":")).replace("<", "\\u003c")
+        return json.dumps(self.model_dump(mode="json"), separators=(",", ":")).replace("<", "\\u003c")
 
     def page(self) -> str:
         """The same as an HTML page that checks itself. Its policy forbids every connection and any other script."""
@@ -194,11 +185,11 @@ class Statement(NamedTuple):
         }  # fmt: skip
 
     def proves(self) -> Iterator[str]:
-        sealed = [one.header.sealed_ms * 10**6 for one in self.records]
+        sealed, count = [one.header.sealed_ms * 10**6 for one in self.records], len(self.records)
         low, high = time_text(min(sealed)), time_text(max(sealed))
         last, standing = self.blocks[-1], self.standing
         yield (
-            f"The robot {self.robot} signed {_records(len(self.records))} as given here, sealed"
+            f"The robot {self.robot} signed {count:,} record{'' if count == 1 else 's'} as given here, sealed"
             f" {f'at {low}' if low == high else f'between {low} and {high}'} by its own clock. The robot is whoever has"
             " the key for which the CA made its certificate."
         )
@@ -274,7 +265,7 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
         raise VerificationError("the registrations are not those that the contract has")
     told("the registrations of the robot are all that the contract has")
     certificates = verifier.verdict().certificates
-    records = tuple(_records_of(evidence, log, data, certificates, headers))
+    records = tuple(_records_of(evidence, verifier, data, headers))
     for one in certificates:
         if one.key is not None:
             told(f"the CA made the robot's certificate {grouped(one.fingerprint)}, used from chunk {one.first} on")
@@ -300,42 +291,28 @@ def _events(
 
 
 def _records_of(
-    evidence: Evidence, log: Log, data: Sequence[DataEvent], certificates: Sequence[Governing],
-    headers: Sequence[chain.Header],
-) -> Iterator[ShownRecord]:  # fmt: skip
+    evidence: Evidence, verifier: Verifier, data: Sequence[DataEvent], headers: Sequence[chain.Header]
+) -> Iterator[ShownRecord]:
     written = {index: (chunk, event.block) for event in data for index, chunk in enumerate(event.chunks, event.first)}
     blocks, signed = {header.number: header for header in headers}, dict[int, Header]()
     if not _ascend([(one.chunk, one.record) for one in evidence.records]):
         raise VerificationError("the records are not in order")
     for one in evidence.records:
         where = f"record {one.record} of chunk {one.chunk}"
-        encoded, block = written.get(one.chunk, (b"", 0))
+        if one.chunk not in written:
+            raise VerificationError(f"{where}: no event has this chunk")
+        encoded, block = written[one.chunk]
         try:
             if one.chunk not in signed:
-                signed[one.chunk] = _signed(log, one.chunk, encoded, certificates)
+                signed[one.chunk] = verifier.authentic(one.chunk, encoded)[0].header
             header, line = signed[one.chunk], one.line.encode()
             check_proof(header.root, header.records, line, Proof(one.record, one.salt, tuple(one.path)))
             content = parse_line(line, header.max_line)
         except (VerificationError, UnicodeEncodeError) as error:
-            raise VerificationError(f"{where}: {shown(str(error))}") from None
+            raise VerificationError(f"{where}: {shown(str(error), 300)}") from None
         if not isinstance(content, MessageLine):
             raise VerificationError(f"{where}: it is no captured message")
         yield ShownRecord(one.chunk, one.record, line, content, header, blocks[block])
-
-
-def _signed(log: Log, index: int, encoded: bytes, certificates: Sequence[Governing]) -> Header:
-    """The header of the chunk, which the robot signed under the certificate that governs it."""
-    if not encoded:
-        raise VerificationError("no event has this chunk")
-    chunk = Chunk.parse(encoded)
-    signers = [one for one in certificates if one.first <= index]
-    if not signers or signers[-1].key is None:
-        raise VerificationError(f"no certificate governs it: {signers[-1].why if signers else 'none is registered'}")
-    if not is_signed(log, signers[-1].key, chunk):
-        raise VerificationError("the robot did not sign its chunk")
-    if chunk.header.sealed_ms > signers[-1].ends_ms:
-        raise VerificationError("its chunk was sealed after the end of the robot's certificate")
-    return chunk.header
 
 
 def _ascend(values: Sequence[Any]) -> bool:
@@ -344,10 +321,6 @@ def _ascend(values: Sequence[Any]) -> bool:
 
 def _fingerprints(certificates: Sequence[bytes]) -> str:
     return ", ".join(grouped(sm3.digest(one).hex()) for one in certificates)
-
-
-def _records(count: int) -> str:
-    return f"{count:,} record" + ("" if count == 1 else "s")
 
 
 def _blocks(blocks: Sequence[chain.Header]) -> str:

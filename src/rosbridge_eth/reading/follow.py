@@ -40,7 +40,8 @@ class Followed:
         self.reading: Reading | None = None
         self._before: Reading | None = None  # to go on behind
         self._given, self._until = 0, inf
-        self._told, self._told_trouble, self._told_how = set[tuple[Kind, str]](), "", False
+        self._told: set[tuple[Kind, str]] | None = None  # until it was told how it stands
+        self._told_trouble = ""
 
     def new(self, choice: Choice, now: float) -> Iterator[ProvenRecord]:
         """The records that were not given before. What is behind chunks that a node withholds comes after those."""
@@ -73,9 +74,9 @@ class Followed:
         self._told_trouble = self.trouble
         if self.reading is not None:
             verdict = self.reading.verdict()
-            if not self._told_how:
+            if self._told is None:
+                self._told = set()
                 yield next(verdict.lines())
-            self._told_how = True
             for found in verdict.findings:
                 if (found.kind, found.detail) not in self._told:
                     yield f"{self.name}: {found}"

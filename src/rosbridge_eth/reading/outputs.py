@@ -26,12 +26,13 @@ import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
 from math import isfinite
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, TypeAlias
 
 import numpy
 from rosbags.interfaces import Nodetype
@@ -68,15 +69,10 @@ def proof(record: ProvenRecord) -> dict[str, Any]:
     """Which record this is and where the chain has it."""
     place = record.place
     return {
-        "chunk": place.chunk,
-        "record": record.number,
-        "stream": place.stream.hex(),
-        "number": place.number,
-        "digest": place.digest.hex(),
-        "block": place.block,
-        "block_time": time_text(place.block_time * 10**9),
+        "chunk": place.chunk, "record": record.number, "stream": place.stream.hex(), "number": place.number,
+        "digest": place.digest.hex(), "block": place.block, "block_time": time_text(place.block_time * 10**9),
         "transaction": "0x" + place.transaction.hex(),
-    }
+    }  # fmt: skip
 
 
 def json_line(record: ProvenRecord) -> str:
@@ -136,13 +132,10 @@ class Table:
         self._rows, self._grows = rows, grows
         self._flushed, self._header = 0, -1  # how far the rows are there, under so many columns
         self._columns: dict[str, set[str]] = {}
-        self._times: dict[TypeLine | None, frozenset[str]] = {None: frozenset()}
 
     def write(self, record: ProvenRecord) -> None:
         content, place = record.content, record.place
-        if record.definition not in self._times:
-            self._times[record.definition] = _time_fields(record.definition)
-        times, cells = self._times[record.definition], dict(flattened(content.data, ""))
+        times, cells = _time_fields(record.definition), dict(flattened(content.data, ""))
         for column, value in cells.items():
             if column in self._columns or len(self._columns) < MAX_COLUMNS:
                 kind = _kind(value)
@@ -233,10 +226,13 @@ def _arrow(pyarrow: Any, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
     return pyarrow.string(), str if kinds <= {"text", "nan"} else json.dumps
 
 
+@lru_cache(maxsize=256)
 def _time_fields(definition: TypeLine | None) -> frozenset[str]:
     """Paths of a type's fields that are points in time."""
+    if definition is None:
+        return frozenset()
     try:
-        fields = {} if definition is None else definition.decoder().fields
+        fields = definition.decoder().fields
     except VerificationError:
         return frozenset()
 
@@ -245,7 +241,7 @@ def _time_fields(definition: TypeLine | None) -> frozenset[str]:
             if node == Nodetype.NAME:
                 yield from [path + name] if kind == TIME else walk(str(kind), f"{path}{name}.")
 
-    return frozenset(walk(definition.type_name, "")) if definition else frozenset()
+    return frozenset(walk(definition.type_name, ""))
 
 
 def _cell(value: Any) -> Any:
@@ -428,10 +424,10 @@ def check_picture(path: Path) -> str:
     return kind
 
 
-_Point = TypeVar("_Point", bound=tuple[float, ...])
+_Point: TypeAlias = tuple[float, float, float]
 
 
-class _Points(Generic[_Point]):
+class _Points:
     """Any number of points as `most` of them: neighbours become one by `merge`, all over the length alike."""
 
     def __init__(self, merge: Callable[[_Point, _Point], _Point], most: int = MAX_POINTS) -> None:
@@ -455,7 +451,7 @@ class Trajectory:
 
     def __init__(self, most: int = MAX_POINTS) -> None:
         self._most = most
-        self.tracks: dict[str, _Points[tuple[float, float, float]]] = {}
+        self.tracks: dict[str, _Points] = {}
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
@@ -490,7 +486,7 @@ class Curves:
         if wrong := [field for field in fields if not re.fullmatch(r"\w+(\[\d+\]|\.\w+)*", field)]:
             raise ConfigError(f"{wrong[0]} names no field; write it like pose.pose.position.x or ranges[0]")
         self._paths = {field: re.findall(r"\w+", field) for field in fields}
-        self.curves: dict[tuple[str, str], _Points[tuple[float, float, float]]] = {}
+        self.curves: dict[tuple[str, str], _Points] = {}
 
     def write(self, record: ProvenRecord) -> None:
         for field_, path in self._paths.items():
@@ -529,7 +525,8 @@ def _figure(path: Path, width: float, height: float) -> Iterator[Any]:
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
-        figure.savefig(path, format=kind, dpi=150)
+        with _whole(path) as within:
+            figure.savefig(within, format=kind, dpi=150)
 
 
 def _position(data: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -555,7 +552,7 @@ def _is_distance(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _FARTHEST and isfinite(value)
 
 
-def _draw_track(axes: Any, label: str, count: int, track: list[tuple[float, float, float]]) -> None:
+def _draw_track(axes: Any, label: str, count: int, track: list[_Point]) -> None:
     xs, ys = [x for _, x, _ in track], [y for _, _, y in track]
     seconds = (track[-1][0] - track[0][0]) / 1e9
     # A label that begins with "_" would be left out of the legend.

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from eth_utils.crypto import keccak
 
-from rosbridge_eth.capture import (  # isort: skip
-    LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line,
-)  # fmt: skip
+from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line
+
 from rosbridge_eth.chunk import (  # isort: skip
     Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id, signed_as,
 )  # fmt: skip
@@ -113,10 +112,11 @@ class ProvenChunk:
     records: tuple[ProvenRecord, ...] = field(repr=False)
 
 
-class _Refused(Exception):
+class Refused(VerificationError):
     """A check ends a chunk, with this finding."""
 
     def __init__(self, kind: Kind, detail: str = "", *, count: int = 1) -> None:
+        super().__init__(f"{kind.label}: {kind.meaning}{f' ({detail})' if detail else ''}")
         self.kind, self.detail, self.count = kind, detail, count
 
 
@@ -226,7 +226,7 @@ class Verifier:
                 proven = None
                 try:
                     proven = self._chunk(index, encoded, event)
-                except _Refused as refused:
+                except Refused as refused:
                     self.findings.add(refused.kind, index, count=refused.count, detail=refused.detail)
                 if mark is not None and self._at.count == mark.count:
                     self._marked = True
@@ -250,46 +250,54 @@ class Verifier:
 
     def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
-        signer = self._governing(index)
-        try:
-            chunk = Chunk.parse(encoded)
-        except Malformed as error:
-            self._at.digest = sm3.digest(encoded).hex()
-            raise _Refused(Kind.MALFORMED, shown(str(error))) from None
+        chunk, purpose, signer = self.authentic(index, encoded)
         header = chunk.header
-        self._at.digest = header.digest.hex()
-        if signer is None or signer.key is None:
-            raise _Refused(Kind.UNTRUSTED, "no certificate is registered" if signer is None else signer.why)
-        try:
-            purpose = signed_as(self.log, signer.key, chunk)
-        except Forged:
-            elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
-            raise _Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
-        if header.sealed_ms > signer.ends_ms:
-            end = time_text(signer.ends_ms * 10**6)
-            raise _Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
         self._follow(index, header)
         self._check_clock(index, header, signer, event.block)
         self._at.head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
         if chunk.body and sm3.digest(chunk.body) != header.body_digest:
-            raise _Refused(Kind.ALTERED, "the body is not the one that the header names")
+            raise Refused(Kind.ALTERED, "the body is not the one that the header names")
         if purpose == "dropped":
-            raise _Refused(Kind.DROPPED, count=header.records)
+            raise Refused(Kind.DROPPED, count=header.records)
         if chunk.bare:
             chunk = replace(chunk, body=self._body(header))
         time = self._time(event.block)
         place = Place(index, header.stream, header.number, header.digest, event.block, time, event.transaction)
         return self._open(place, chunk)
 
+    def authentic(self, index: int, encoded: bytes) -> tuple[Chunk, str, Governing]:
+        """The chunk that the robot wrote, for what purpose it signed it, and what governs it; else Refused.
+
+        The body is not looked at. index: in the robot's log; it does not go back from call to call.
+        """
+        signer = self._governing(index)
+        try:
+            chunk = Chunk.parse(encoded)
+        except Malformed as error:
+            self._at.digest = sm3.digest(encoded).hex()
+            raise Refused(Kind.MALFORMED, shown(str(error))) from None
+        self._at.digest = chunk.header.digest.hex()
+        if signer is None or signer.key is None:
+            raise Refused(Kind.UNTRUSTED, "no certificate is registered" if signer is None else signer.why)
+        try:
+            purpose = signed_as(self.log, signer.key, chunk)
+        except Forged:
+            elsewhere = any(_is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
+            raise Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
+        if chunk.header.sealed_ms > signer.ends_ms:
+            end = time_text(signer.ends_ms * 10**6)
+            raise Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
+        return chunk, purpose, signer
+
     def _body(self, header: Header) -> bytes:
         """From the archive. It is refused as withheld where the archive has none, or another."""
         if self._bodies is None:
-            raise _Refused(Kind.ARCHIVED, count=header.records)
+            raise Refused(Kind.ARCHIVED, count=header.records)
         body = self._bodies(header.body_digest, header.body_length)
         if body is None or len(body) != header.body_length or sm3.digest(body) != header.body_digest:
             self._bodies_withheld += 1
             what = "is not in the archive" if body is None else "is another in the archive"
-            raise _Refused(Kind.WITHHELD, f"the body {header.body_digest.hex()} {what}")
+            raise Refused(Kind.WITHHELD, f"the body {header.body_digest.hex()} {what}")
         return body
 
     # --- links
@@ -306,7 +314,7 @@ class Verifier:
         # In an unbroken log nothing can be there twice; after a break, what follows may have been read before it.
         known = self.links.index_of(header.digest) if self._broken else None
         if known is not None:
-            raise _Refused(Kind.FORKED, f"the chunk of index {known} once more")
+            raise Refused(Kind.FORKED, f"the chunk of index {known} once more")
         if breaks:
             self._tell_break(index, header, ahead, same_stream)
         if head is not None and not same_stream and (knows_none or not head.goodbye):
@@ -357,11 +365,11 @@ class Verifier:
             key = self.key_of(chunk.header)
             lines = open_lines(self.log, chunk, key)
         except NoGrant:
-            raise _Refused(Kind.NO_GRANT, count=count) from None
+            raise Refused(Kind.NO_GRANT, count=count) from None
         except Unopenable as error:
             if key and key == self._granted.get(place.digest):  # who gave it could open the chunk
                 raise VerificationError(f"a wrong key was granted for {chunk.header}: remove that grant") from None
-            raise _Refused(Kind.UNOPENABLE, shown(str(error))) from None
+            raise Refused(Kind.UNOPENABLE, shown(str(error))) from None
         records = tuple(self._parsed(place, lines, chunk.header.max_line))
         self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
@@ -437,8 +445,7 @@ class Verifier:
         return Bookmark(self._at.count, self._at.digest, tuple(dict.fromkeys(known)))
 
 
-def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
-    """Whether the robot signed this header, for this form of the chunk; the body is looked at afterwards."""
+def _is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
     try:
         return bool(signed_as(log, key, chunk))
     except Forged:

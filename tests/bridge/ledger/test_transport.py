@@ -43,7 +43,8 @@ def ledger(node: HostileNode, timeout: float = 5.0) -> Ledger:
     return Ledger(node.url, CONTRACT, timeout=timeout)
 
 
-def test_an_answer_that_comes_a_byte_now_and_then_is_given_up():
+@pytest.mark.parametrize("through_a_proxy", [False, True])
+def test_an_answer_that_comes_a_byte_now_and_then_is_given_up(through_a_proxy: bool, monkeypatch: pytest.MonkeyPatch):
     def drip(connection: socket.socket, body: Any) -> None:
         for byte in http(json.dumps({"jsonrpc": "2.0", "id": 0, "result": "0x1"}).encode()):
             if node.over.wait(0.1):
@@ -57,9 +58,12 @@ def test_an_answer_that_comes_a_byte_now_and_then_is_given_up():
 
     for answer in (drip, drip_body):
         with HostileNode(answer) as node:
-            began = time.monotonic()
+            began, url = time.monotonic(), node.url
+            if through_a_proxy:
+                monkeypatch.setenv("http_proxy", node.url)
+                url = "http://node.example"
             with pytest.raises(ChainUnavailable, match="too slow"):
-                ledger(node, timeout=0.5).block_number()
+                Ledger(url, CONTRACT, timeout=0.5).block_number()
             assert time.monotonic() - began < 2
 
 

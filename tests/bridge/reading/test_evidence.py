@@ -249,7 +249,7 @@ def test_a_body_that_was_cut_off_makes_no_dropped_or_archived_chunk(node: Anvil,
     place, content = Place(0, b"", 0, b"", standing.data_block, 0, b""), parse_line(odometry(1))
     monkeypatch.setattr(evidence_of, "verify", lambda *_: None)
     text = make(reading, [ProvenRecord(place, 0, odometry(1), content, None)]).encode()  # type: ignore[arg-type]
-    with pytest.raises(VerificationError, match="did not sign"):
+    with pytest.raises(VerificationError, match="forged: not signed by the robot"):
         check(text)
     assert "did not sign" in javascript([text])[0]
 
@@ -440,7 +440,7 @@ def test_who_is_not_the_robot_by_the_ca_is_refused(ca, role, name, node: Anvil, 
         made.write(made.pen.write(odometry(1)))
         evidence = made.evidence(Choice("/robot_1/odom"), [ca.certificate])
     text = evidence.model_copy(update={"authorities": [ROOTS[0].to_der()]}).encode()
-    with pytest.raises(VerificationError, match="no certificate governs it"):
+    with pytest.raises(VerificationError, match="no certificate of this robot that is to be trusted governs this"):
         check(text)
     [answer] = javascript([text])
     assert "no certificate governs it" in answer

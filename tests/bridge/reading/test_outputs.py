@@ -373,6 +373,18 @@ def test_topics_in_a_picture_are_bounded(tmp_path):
     assert drawn(tmp_path / "track.png", [point(n, topic=f"/t{n}") for n in range(100)]) == outputs.MAX_TRACKS
 
 
+def test_a_picture_that_is_cut_off_leaves_the_one_before(tmp_path, monkeypatch):
+    def savefig(self: Any, path: Path, **options: Any) -> None:
+        Path(path).write_bytes(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "p.png").write_bytes(b"the one before")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", savefig)
+    with pytest.raises(OSError, match="No space"):
+        drawn(tmp_path / "p.png", [point(1)])
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"the one before"]
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf"])
 def test_without_positions_the_picture_says_so(tmp_path, name):
     assert drawn(tmp_path / name, []) == 0
