@@ -282,7 +282,7 @@ class Verifier:
         try:
             purpose = signed_as(self.log, signer.key, chunk)
         except Forged:
-            elsewhere = any(_is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
+            elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
             raise Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
         if chunk.header.sealed_ms > signer.ends_ms:
             end = time_text(signer.ends_ms * 10**6)
@@ -445,7 +445,8 @@ class Verifier:
         return Bookmark(self._at.count, self._at.digest, tuple(dict.fromkeys(known)))
 
 
-def _is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
+def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
+    """Whether the robot signed this header, for this form of the chunk."""
     try:
         return bool(signed_as(log, key, chunk))
     except Forged:
