@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,12 +21,21 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
+from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.errors import BridgeError, VerificationError
+from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.identity import Trust, load_ca, load_identity
+from rosbridge_eth.logs import log_to_stderr
+from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
+from rosbridge_eth.registry import Registry
+from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.terminal import Json, data, errors, print_json, table, talk
+from rosbridge_eth.topics import robot_toml
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger import DataEvent, Ledger
     from rosbridge_eth.ledger.submitter import Submitter
-    from rosbridge_eth.reading import ProvenRecord, Verdict
     from rosbridge_eth.reading.compare import Comparison
     from rosbridge_eth.relay import Harm
     from rosbridge_eth.robot import Robot
@@ -80,34 +90,24 @@ class DemoResult:
 @contextmanager
 def _serving(worker: Worker, submitter: Submitter) -> Iterator[Callable[[], None]]:
     """The server's parts, in two threads; gives what raises their failure in this one."""
-    stop, failures = threading.Event(), list[BaseException]()
+    stop = threading.Event()
 
     def submit() -> None:
         while not stop.wait(min(0.05, submitter.turn(time.time()))):
             continue
 
-    def run(task: Callable[[], None]) -> None:
-        try:
-            task()
-        except BaseException as error:
-            failures.append(error)
-            stop.set()
-
     def check() -> None:
-        if failures:
-            raise failures[0]
+        for task in tasks:
+            if task.done():
+                task.result()
 
-    tasks = {"worker": lambda: worker.run(stop.is_set), "submitter": submit}
-    threads = [threading.Thread(target=run, args=(task,), name=name, daemon=True) for name, task in tasks.items()]
-    for thread in threads:
-        thread.start()
-    try:
-        yield check
-    finally:
-        stop.set()
-        worker.loop.wake()
-        for thread in threads:
-            thread.join(10)
+    with ThreadPoolExecutor(2) as threads:
+        tasks = [threads.submit(worker.run, stop.is_set), threads.submit(submit)]
+        try:
+            yield check
+        finally:
+            stop.set()
+            worker.loop.wake()
     check()
 
 
@@ -122,21 +122,13 @@ def run_demo(
     of them. on_stage: is told what begins. on_turn: is given the robot at each turn of its loop.
     """
     from rosbridge_eth import administration
-    from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
-    from rosbridge_eth.channel.udp import UdpLoop, server_sockets
-    from rosbridge_eth.config import load_robot_config, load_server_config
-    from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
-    from rosbridge_eth.identity import Trust, load_ca, load_identity
     from rosbridge_eth.ledger import Keyring, Ledger
     from rosbridge_eth.ledger.nodes import EmbeddedChain
-    from rosbridge_eth.reading import read_robot
     from rosbridge_eth.reading.compare import compare
-    from rosbridge_eth.registry import Registry
     from rosbridge_eth.relay import Harm, Relay
     from rosbridge_eth.robot import open_robot
     from rosbridge_eth.server import Worker
     from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
-    from rosbridge_eth.topics import robot_toml
 
     started, stages = time.monotonic(), Stages()
     home, robot_home, reader_home = (
@@ -210,21 +202,15 @@ def run_demo(
         comparison = compare(bag, topics, [record.content for record in records])
     stages.verified = comparison.equal
     on_progress(stages)
-    tk = reading.verifier.log.tk
-    events = ledger.data_events(tk, 0, ledger.block_number())
+    transactions = [
+        Transaction(event.block, len(event.chunks), sum(map(len, event.chunks)),
+                    0 if (receipt := ledger.receipt(event.transaction)) is None else receipt.gas_used,
+                    "0x" + event.transaction.hex())
+        for event in ledger.data_events(reading.verifier.log.tk, 0, ledger.block_number())
+    ]  # fmt: skip
     return DemoResult(
-        stages, tuple(_transactions(ledger, events)), verdict, records, comparison, deployment.contract,
-        time.monotonic() - started,
+        stages, tuple(transactions), verdict, records, comparison, deployment.contract, time.monotonic() - started
     )
-
-
-def _transactions(ledger: Ledger, events: Iterable[DataEvent]) -> Iterator[Transaction]:
-    for event in events:
-        receipt = ledger.receipt(event.transaction)
-        yield Transaction(
-            event.block, len(event.chunks), sum(map(len, event.chunks)), 0 if receipt is None else receipt.gas_used,
-            "0x" + event.transaction.hex(),
-        )
 
 
 # The command
@@ -238,10 +224,9 @@ def demo(
     report: Annotated[Path, typer.Option(help="Folder for the report; made if absent.")] = Path("demo-report"),
     bag: Annotated[Path | None, typer.Option(help="A bag of your own; without it, the sample.")] = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
-    loss: Annotated[
-        float, typer.Option(min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")
-    ] = 0.0,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")] = False,
+    loss: Annotated[float, typer.Option(
+        min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")] = 0.0,
+    json: Json = False,
 ) -> None:
     """Replay a real bag over real UDP onto an Ethereum chain in this process, read it back, prove and compare it.
 
@@ -249,11 +234,8 @@ def demo(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from rosbridge_eth.logs import log_to_stderr
     from rosbridge_eth.reading import outputs
     from rosbridge_eth.relay import Harm
-    from rosbridge_eth.sources.bag import sample_bag
-    from rosbridge_eth.terminal import data, errors, print_json, table, talk
 
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
@@ -262,7 +244,8 @@ def demo(
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=errors))
         home = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosbridge-eth-"))
-        total = _expected(chosen, topics)
+        with closing(BagSource(chosen, Selection(topics))) as opened:
+            total = opened.message_count
         bars = {name: progress.add_task(name, total=total) for name in ("captured", "stored", "verified")}
 
         def show(stages: Stages) -> None:
@@ -312,16 +295,6 @@ def demo(
         raise VerificationError("not every record came back as it is in the bag; the lines above say which")
     talk(f"{stages.verified} of {stages.captured} records came back from the chain, proven and equal to the bag's, "
          f"in {result.seconds:.1f} s. The report is {report / 'report.html'}.")
-
-
-def _expected(bag: Path, topics: list[str]) -> int:
-    from rosbridge_eth.sources import BagSource, Selection
-
-    source = BagSource(bag, Selection(topics))
-    try:
-        return source.message_count
-    finally:
-        source.close()
 
 
 def _html(

@@ -18,11 +18,12 @@ from contextlib import closing, suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import typer
 
 from rosbridge_eth import identity as ids
+from rosbridge_eth import sources
 from rosbridge_eth.bundle import needs_password, read_bundle
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
@@ -34,8 +35,10 @@ from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError, Store
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
+from rosbridge_eth.spool import Spool
 from rosbridge_eth.status import ANSWER_TIME, DEAD, span
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
+from rosbridge_eth.topics import offered
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger
@@ -62,13 +65,14 @@ class Finding(NamedTuple):
     mend: str = ""
 
 
+Home: TypeAlias = OperatorHome | RobotHome | ReaderHome
 Findings: TypeAlias = Iterator[Finding]
-Check: TypeAlias = Callable[[Path, bytes | None], Findings]
-"""A check is given the home and, where there is one, the passphrase of its keys."""
+Check: TypeAlias = Callable[[Any, bytes | None], Findings]
+"""A check is given the home, as what it is, and, where there is one, the passphrase of its keys."""
 ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note", "broken", "skipped"))
 
 
-def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Findings:
+def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Findings:
     """Run the checks one after the other; a failure of the bridge's own is a finding, and its text has the mend."""
     for what, check in checks.items():
         try:
@@ -87,7 +91,7 @@ def examine(checks: Mapping[str, Check], home: Path, secret: bytes | None) -> Fi
 # The machine
 
 
-def clock(home: Path, secret: bytes | None) -> Findings:
+def clock(home: Home, secret: bytes | None) -> Findings:
     from rosbridge_eth.robot import clock_synchronised
 
     now = datetime.now(UTC)
@@ -100,30 +104,31 @@ def clock(home: Path, secret: bytes | None) -> Findings:
         yield ok("clock", "synchronised")
 
 
-def files(home: Path, secret: bytes | None) -> Findings:
-    mode = stat.S_IMODE(home.stat().st_mode)
+def files(home: Home, secret: bytes | None) -> Findings:
+    mode = stat.S_IMODE(home.path.stat().st_mode)
     if mode & 0o077:
         result, may = (broken, "write to") if mode & 0o022 else (note, "look into")
-        yield result("home", f"others may {may} {home} (mode {mode:04o})", f"chmod 700 {home}")
-    elif not os.access(home, os.W_OK):
-        yield broken("home", f"{home} is not writable for this user", "run as the user the service runs as")
+        yield result("home", f"others may {may} {home.path} (mode {mode:04o})", f"chmod 700 {home.path}")
+    elif not os.access(home.path, os.W_OK):
+        yield broken("home", f"{home.path} is not writable for this user", "run as the user the service runs as")
     else:
-        yield ok("home", f"{home}, its owner's alone")
-    for key in sorted([*home.rglob("*.key.pem"), *home.glob("accounts.json")]):
+        yield ok("home", f"{home.path}, its owner's alone")
+    for key in sorted([*home.path.rglob("*.key.pem"), *home.path.glob("accounts.json")]):
         mode = stat.S_IMODE(key.stat().st_mode)
         if mode & 0o077:
             yield broken("key files", f"{key} is open to others (mode {mode:04o})",
                          f"chmod 600 {key}, and if it may have been read, make its keys anew")
 
 
-def disk(home: Path, secret: bytes | None) -> Findings:
-    found = os.statvfs(home)
+def disk(home: Home, secret: bytes | None) -> Findings:
+    found = os.statvfs(home.path)
     free = found.f_bavail * found.f_frsize
     if free < LITTLE_ROOM or (found.f_files and not found.f_favail):
-        yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home}",
+        yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home.path}",
                      "make room: until there is some nothing more is taken; what was taken is safe")
     elif free < SOME_ROOM:
-        yield note("disk", f"{free >> 20} MiB free at {home}", "make room; chunks wait here while the chain is away")
+        yield note("disk", f"{free >> 20} MiB free at {home.path}",
+                   "make room; chunks wait here while the chain is away")
     else:
         yield ok("disk", f"{free >> 30} GiB free")
 
@@ -219,11 +224,11 @@ def chain(ledger: Ledger) -> Findings:
 # An operator's home
 
 
-def operator_configuration(home: Path, secret: bytes | None) -> Findings:
-    config = load_server_config(OperatorHome(home).config)
-    yield ok("configuration", str(OperatorHome(home).config))
+def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings:
+    config = load_server_config(home.config)
+    yield ok("configuration", str(home.config))
     robots = str(config.address_for_robots())
-    for bundle in sorted(OperatorHome(home).bundles.glob("*.bundle")):
+    for bundle in sorted(home.bundles.glob("*.bundle")):
         content = bundle.read_bytes()
         try:
             told = robots if needs_password(content) else read_bundle(content).end.server_address
@@ -238,20 +243,20 @@ def operator_configuration(home: Path, secret: bytes | None) -> Findings:
                          f'write server = "{robots}" into the robot.toml of who joined with it')
 
 
-def operator_passphrase(home: Path, secret: bytes | None) -> Findings:
+def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Keyring
 
     if secret is None:
         yield skipped("passphrase", "not tried", "give --passphrase-file")
         return
-    ids.load_identity(OperatorHome(home).server, secret)
-    Keyring.load(OperatorHome(home).accounts, secret)
+    ids.load_identity(home.server, secret)
+    Keyring.load(home.accounts, secret)
     yield ok("passphrase", "opens the server's keys and the accounts")
 
 
-def door(home: Path, secret: bytes | None) -> Findings:
+def door(home: OperatorHome, secret: bytes | None) -> Findings:
     """The robots' UDP port is free, or a server answers there; the same of the monitor's."""
-    config = load_server_config(OperatorHome(home).config)
+    config = load_server_config(home.config)
     try:
         for sock in server_sockets(config.listen):
             sock.close()
@@ -278,24 +283,23 @@ def door(home: Path, secret: bytes | None) -> Findings:
                    f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER}, and in /etc/sysctl.d")
 
 
-def registry(home: Path, secret: bytes | None) -> Findings:
-    with Registry(OperatorHome(home).registry) as opened:
+def registry(home: OperatorHome, secret: bytes | None) -> Findings:
+    with Registry(home.registry) as opened:
         yield ok("registry", f"{sum(name.revoked_at is None for name in opened.all())} names in force")
 
 
-def store(home: Path, secret: bytes | None) -> Findings:
+def store(home: OperatorHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.supervisor import open_store
 
-    place = OperatorHome(home)
-    if not place.deployment_file.exists():
-        yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home}`")
+    if not home.deployment_file.exists():
+        yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home.path}`")
         return
     try:
-        inbox = open_store(load_server_config(place.config), place, read_only=True)
+        inbox = open_store(load_server_config(home.config), home, read_only=True)
     except NothingThere:
         yield ok("store", "there is none yet; the server makes it")
         return
-    with closing(inbox), Registry(place.registry) as opened:
+    with closing(inbox), Registry(home.registry) as opened:
         inbox.check()
         names, held = opened.names(), inbox.totals()
         yield ok("store", f"{sum(waiting.chunks for waiting in held.values())} chunks wait")
@@ -306,11 +310,11 @@ def store(home: Path, secret: bytes | None) -> Findings:
             yield note("dead letters", f"{len(dead)}, the last: {dead[0].why}", "docs/operations.md, Dead letters")
 
 
-def archive(home: Path, secret: bytes | None) -> Findings:
+def archive(home: OperatorHome, secret: bytes | None) -> Findings:
     """The operator's archive keeps an object and gives it back."""
     from rosbridge_eth.archive import open_archive
 
-    config = load_server_config(OperatorHome(home).config).archive
+    config = load_server_config(home.config).archive
     if config is None:
         return
     opened = open_archive(config)
@@ -322,31 +326,30 @@ def archive(home: Path, secret: bytes | None) -> Findings:
         yield note("archive", f"written and read; {error}", "one small object stays; nothing else is ever deleted")
 
 
-def readers_archive(home: Path, secret: bytes | None) -> Findings:
+def readers_archive(home: ReaderHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.archive import open_archive
 
-    config = load_reader_config(ReaderHome(home).config).archive
+    config = load_reader_config(home.config).archive
     if config is not None:
         opened = open_archive(config)
         opened.get(bytes(32), 0)
         yield ok("archive", f"{opened} answers")
 
 
-def operator_node(home: Path, secret: bytes | None) -> Findings:
+def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.ledger.contract import WEI_PER_ETH
 
-    place = OperatorHome(home)
-    config = load_server_config(place.config)
-    with closing(Ledger.connect(config.chain.url, place.deployment())) as ledger, Registry(place.registry) as opened:
+    config = load_server_config(home.config)
+    with closing(Ledger.connect(config.chain.url, home.deployment())) as ledger, Registry(home.registry) as opened:
         yield from chain(ledger)
-        if ledger.operator() != place.account:
-            yield broken("operator", f"the contract's operator is {ledger.operator()}, this home's {place.account}",
+        if ledger.operator() != home.account:
+            yield broken("operator", f"the contract's operator is {ledger.operator()}, this home's {home.account}",
                          "use the home of that account, or let it offer and this one accept the role")
-        treasury = ledger.balance(place.account) / WEI_PER_ETH
+        treasury = ledger.balance(home.account) / WEI_PER_ETH
         if treasury < config.funds.by:
-            yield broken("treasury", f"{place.account} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
-                         f"send ETH to {place.account}")
+            yield broken("treasury", f"{home.account} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
+                         f"send ETH to {home.account}")
         else:
             yield ok("treasury", f"{treasury:.4f} ETH")
         robots = {tk: robot for tk, robot in opened.robots().items() if robot.revoked_at is None}
@@ -362,9 +365,9 @@ def operator_node(home: Path, secret: bytes | None) -> Findings:
 # A robot's home
 
 
-def bridge(home: Path, secret: bytes | None) -> Findings:
-    end, config = RobotHome(home).bridge(), load_robot_config(RobotHome(home).config)
-    yield ok("configuration", str(RobotHome(home).config))
+def bridge(home: RobotHome, secret: bytes | None) -> Findings:
+    end, config = home.bridge(), load_robot_config(home.config)
+    yield ok("configuration", str(home.config))
     place = config.server or parse_address(end.server_address)
     if place.host in ANYWHERE or place.port == 0:
         yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
@@ -373,27 +376,22 @@ def bridge(home: Path, secret: bytes | None) -> Findings:
         yield ok("bridge", f"{end.robot} sends to {end.server_name} at {place}")
 
 
-def robot_certificates(home: Path, secret: bytes | None) -> Findings:
-    name, place = RobotHome(home).bridge().robot, RobotHome(home)
-    mend = f"let the operator run `register {name} REQUEST --replace` with {place.request.name}, and join again"
-    yield from certificates(place.identity, mend)
+def robot_certificates(home: RobotHome, secret: bytes | None) -> Findings:
+    answer = f"`register {home.bridge().robot} REQUEST --replace` with {home.request.name}"
+    yield from certificates(home.identity, f"let the operator run {answer}, and join again")
 
 
-def readers(home: Path, secret: bytes | None) -> Findings:
+def readers(home: RobotHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.robot import reader_keys
 
-    place = RobotHome(home)
-    roots = ids.read_certificates((place.identity / "ca.crt.pem").read_bytes())
-    yield ok("readers", f"{len(reader_keys(load_robot_config(place.config), place, roots))} can open what it writes")
+    roots = ids.read_certificates((home.identity / "ca.crt.pem").read_bytes())
+    yield ok("readers", f"{len(reader_keys(load_robot_config(home.config), home, roots))} can open what it writes")
 
 
-def source(home: Path, secret: bytes | None) -> Findings:
-    from rosbridge_eth.sources import open_source
-    from rosbridge_eth.topics import offered
-
-    config = load_robot_config(RobotHome(home).config)
+def source(home: RobotHome, secret: bytes | None) -> Findings:
+    config = load_robot_config(home.config)
     settings, why = config.source_and_why(os.environ)
-    with closing(open_source(settings, config.selection())) as opened:
+    with closing(sources.open_source(settings, config.selection())) as opened:
         offers = offered(opened)
     if settings.kind == "sim":
         yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
@@ -403,17 +401,15 @@ def source(home: Path, secret: bytes | None) -> Findings:
         yield ok("source", f"{settings.kind} ({why}) offers {len(offers)} topics")
 
 
-def session(home: Path, secret: bytes | None) -> Findings:
+def session(home: RobotHome, secret: bytes | None) -> Findings:
     """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
     from rosbridge_eth.robot import certificate_clock
     from rosbridge_eth.sender import mend
-    from rosbridge_eth.spool import Spool
 
-    place, runs = RobotHome(home), False
-    end, config = place.bridge(), load_robot_config(place.config)
+    end, config, runs = home.bridge(), load_robot_config(home.config), False
     log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
     try:
-        Spool(place.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
+        Spool(home.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
         yield ok("spool", "opens")
     except NothingThere:
         yield ok("spool", "none yet; the first start makes it")
@@ -426,9 +422,9 @@ def session(home: Path, secret: bytes | None) -> Findings:
         way = "see `status` of this home" if runs else "give --passphrase-file"
         yield skipped("server", f"{server} not tried: {why}", way)
         return
-    identity, roots = ids.load_identity(place.identity, secret)
+    identity, roots = ids.load_identity(home.identity, secret)
     yield ok("password", f"opens the keys of {identity.name}")
-    trust, wall = ids.Trust(roots), certificate_clock(place)
+    trust, wall = ids.Trust(roots), certificate_clock(home)
     found, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
     if isinstance(found, HandshakeFailed):
         silent = (
@@ -447,8 +443,8 @@ def session(home: Path, secret: bytes | None) -> Findings:
 # A reader's folder
 
 
-def reader_keys(home: Path, secret: bytes | None) -> Findings:
-    folder = load_reader_config(ReaderHome(home).config).identity
+def reader_keys(home: ReaderHome, secret: bytes | None) -> Findings:
+    folder = load_reader_config(home.config).identity
     yield from certificates(folder, "let the operator make this reader anew (`reader NAME --replace`)")
     if secret is None:
         yield skipped("passphrase", "not tried", "give --passphrase-file")
@@ -457,32 +453,31 @@ def reader_keys(home: Path, secret: bytes | None) -> Findings:
         yield ok("passphrase", f"opens the keys of {identity.name}")
 
 
-def reader_nodes(home: Path, secret: bytes | None) -> Findings:
+def reader_nodes(home: ReaderHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Ledger
 
-    config = load_reader_config(ReaderHome(home).config)
+    config = load_reader_config(home.config)
     for url in config.chain:
         with closing(Ledger.connect(url, config)) as ledger:
-            ask = partial(chain, ledger)
-            yield from examine({"node": lambda home, secret, ask=ask: ask()}, home, secret)  # type: ignore[misc]
+            yield from examine({"node": lambda ledger, _: chain(ledger)}, ledger, secret)
 
 
 _MACHINE: dict[str, Check] = {"clock": clock, "home": files, "disk": disk}
-CHECKS: dict[HomeKind, dict[str, Check]] = {
-    HomeKind.OPERATOR: _MACHINE | {
+CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
+    HomeKind.OPERATOR: (OperatorHome, _MACHINE | {
         "configuration": operator_configuration,
-        "certificates": lambda home, _: certificates(home / "ca", ""),
+        "certificates": lambda home, _: certificates(home.path / "ca", ""),
         "server's certificates": lambda home, _: certificates(
-            home / "server", f"run `renew --home {home}`, then start the server again"),
+            home.server, f"run `renew --home {home.path}`, then start the server again"),
         "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
-        "archive": archive,
-        "node": operator_node,
-    },
-    HomeKind.ROBOT: _MACHINE | {
+        "archive": archive, "node": operator_node,
+    }),
+    HomeKind.ROBOT: (RobotHome, _MACHINE | {
         "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
         "server": session,
-    },
-    HomeKind.READER: _MACHINE | {"keys": reader_keys, "node": reader_nodes, "archive": readers_archive},
+    }),
+    HomeKind.READER: (ReaderHome, _MACHINE | {
+        "keys": reader_keys, "node": reader_nodes, "archive": readers_archive}),
 }  # fmt: skip
 
 
@@ -512,8 +507,8 @@ def doctor(
         with suppress(BridgeError):  # a configuration that cannot be read is a finding, and told below
             file = load_server_config(OperatorHome(home).config).passphrase_file
     secret = None if file is None else read_passphrase(kind, "", file=file)
-    findings = []
-    for finding in examine(CHECKS[kind], home, secret):
+    findings, (of, checks) = list[Finding](), CHECKS[kind]
+    for finding in examine(checks, of(home), secret):
         findings.append(finding)
         if not json and finding.result != "ok":
             talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}. {finding.mend}")

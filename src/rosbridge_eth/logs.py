@@ -13,7 +13,7 @@ import sys
 import traceback
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, TextIO
+from typing import TextIO
 
 from rosbridge_eth.errors import BridgeError
 
@@ -77,16 +77,11 @@ class JsonFormatter(logging.Formatter):
     """One JSON object."""
 
     def format(self, record: logging.LogRecord) -> str:
-        event: dict[str, Any] = {
-            "time": _time(record),
-            "level": record.levelname.lower(),
-            "part": record.name.removeprefix(LOGGER + "."),
-            "process": record.processName,
-            "event": record.getMessage(),
-        }
-        if failure := _failure(record):
-            event["failure"] = failure
-        return json.dumps(event)
+        failure = _failure(record)
+        return json.dumps({
+            "time": _time(record), "level": record.levelname.lower(), "part": record.name.removeprefix(LOGGER + "."),
+            "process": record.processName, "event": record.getMessage(), **({"failure": failure} if failure else {}),
+        })  # fmt: skip
 
 
 def log_to(stream: TextIO, format: LogFormat, verbosity: int) -> None:

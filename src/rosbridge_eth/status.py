@@ -23,12 +23,13 @@ from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role
+from rosbridge_eth.registry import Enrolment, Registry
+from rosbridge_eth.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Ledger, Standing
-    from rosbridge_eth.registry import Enrolment
 
 _WEI: Final = 10**18
 ANSWER_TIME = 5.0  # seconds for a node or a monitor
@@ -62,7 +63,6 @@ def locate(home: OperatorHome, ledger: Ledger, robot: str, stream: str, number: 
     """Where a robot's chunk is: in the inbox behind what the chain has, or on the chain, by the links of its events."""
     from eth_utils.crypto import keccak
 
-    from rosbridge_eth.registry import Registry
     from rosbridge_eth.supervisor import open_store
 
     config, tk = load_server_config(home.config), robot_id(robot)
@@ -72,11 +72,8 @@ def locate(home: OperatorHome, ledger: Ledger, robot: str, stream: str, number: 
     if len(stream) != 32 or not set(stream.lower()) <= set("0123456789abcdef"):
         raise ConfigError(f"the stream is 32 hex digits, as `read --json` shows it, not {stream!r}")
     [standing], wanted, found = ledger.standings([tk]), (bytes.fromhex(stream), number), Located("unknown")
-    try:
-        with closing(open_store(config, home, read_only=True)) as inbox:
-            found = _in_inbox(inbox, tk, standing, wanted)
-    except NothingThere:
-        pass
+    with suppress(NothingThere), closing(open_store(config, home, read_only=True)) as inbox:
+        found = _in_inbox(inbox, tk, standing, wanted)
     for event in () if found.state == "stored" else ledger.newest_data(tk, standing.data_block):
         for index, encoded in reversed([*enumerate(event.chunks)]):
             header = Chunk.parse(encoded).header
@@ -170,7 +167,6 @@ def _server_processes(config: ServerConfig) -> list[str]:
 
 def _operator(place: OperatorHome) -> Report:
     from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.registry import Registry
 
     config = load_server_config(place.config)
     with Registry(place.registry) as registry:
@@ -204,8 +200,6 @@ def _operator(place: OperatorHome) -> Report:
 
 def fleet(place: OperatorHome) -> RenderableType:
     """The picture of a running server at its terminal, from its own figures alone."""
-    from rosbridge_eth.registry import Registry
-
     report: Report = {"robots": {}, "unknown": [], "dead": []}
     try:
         with Registry(place.registry) as registry:
@@ -271,8 +265,6 @@ def _alarms(report: Report) -> Iterator[str]:
 
 
 def _robot(place: RobotHome) -> Report:
-    from rosbridge_eth.spool import Spool
-
     end, config = place.bridge(), load_robot_config(place.config)
     report: Report = {
         "robot": end.robot, "server": f"{end.server_name} at {config.server or end.server_address}",

@@ -31,28 +31,20 @@ data = Console(highlight=False, emoji=False)
 
 OPERATOR_HOME, ROBOT_HOME, READER_HOME = Path("operator"), Path("robot"), Path("reader")
 
-OperatorHomeOption: TypeAlias = Annotated[
-    Path, typer.Option("--home", help="The operator's folder.", envvar="ROSBRIDGE_ETH_HOME", show_default=True)
-]
-RobotHomeOption: TypeAlias = Annotated[
-    Path, typer.Option("--home", help="The robot's folder.", envvar="ROSBRIDGE_ETH_ROBOT_HOME", show_default=True)
-]
-ReaderHomeOption: TypeAlias = Annotated[
-    Path, typer.Option("--home", help="The reader's folder.", envvar="ROSBRIDGE_ETH_READER_HOME", show_default=True)
-]
-AnyHomeOption: TypeAlias = Annotated[
-    Path, typer.Option("--home", help="An operator's, a robot's or a reader's folder.", envvar="ROSBRIDGE_ETH_HOME")
-]
-PassphraseFile: TypeAlias = Annotated[
-    Path | None,
-    typer.Option("--passphrase-file", help="Read the passphrase from the first line of this file, and do not ask."),
-]
-PasswordFile: TypeAlias = Annotated[
-    Path | None, typer.Option("--password-file", help="Read the robot's password from the first line of this file.")
-]
-Verbose: TypeAlias = Annotated[
-    int, typer.Option("--verbose", "-v", count=True, help="Log what happens on stderr; twice (-vv): every chunk.")
-]
+OperatorHomeOption: TypeAlias = Annotated[Path, typer.Option(
+    "--home", help="The operator's folder.", envvar="ROSBRIDGE_ETH_HOME")]
+RobotHomeOption: TypeAlias = Annotated[Path, typer.Option(
+    "--home", help="The robot's folder.", envvar="ROSBRIDGE_ETH_ROBOT_HOME")]
+ReaderHomeOption: TypeAlias = Annotated[Path, typer.Option(
+    "--home", help="The reader's folder.", envvar="ROSBRIDGE_ETH_READER_HOME")]
+AnyHomeOption: TypeAlias = Annotated[Path, typer.Option(
+    "--home", help="An operator's, a robot's or a reader's folder.", envvar="ROSBRIDGE_ETH_HOME")]
+PassphraseFile: TypeAlias = Annotated[Path | None, typer.Option(
+    "--passphrase-file", help="Read the passphrase from the first line of this file, and do not ask.")]
+PasswordFile: TypeAlias = Annotated[Path | None, typer.Option(
+    "--password-file", help="Read the robot's password from the first line of this file.")]
+Verbose: TypeAlias = Annotated[int, typer.Option(
+    "--verbose", "-v", count=True, help="Log what happens on stderr; twice (-vv): every chunk.")]
 LogFormatOption: TypeAlias = Annotated[LogFormat, typer.Option("--log-format", help="How a line of the log looks.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 

@@ -203,11 +203,9 @@ SourceOption = Annotated[
 
 
 def topics(
-    home: RobotHomeOption = ROBOT_HOME,
-    source: SourceOption = None,
-    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to listen.")] = 5.0,
-    json: Json = False,
-) -> None:
+    home: RobotHomeOption = ROBOT_HOME, source: SourceOption = None,
+    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to listen.")] = 5.0, json: Json = False,
+) -> None:  # fmt: skip
     """What there is to capture: topics, types, rates, sizes; what robot.toml takes of it, and what that costs a day.
 
     Without a robot.toml, everything is taken.

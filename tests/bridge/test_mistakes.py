@@ -56,13 +56,24 @@ def test_a_full_disk_at_the_operators_is_one_line(place: Place, tmp_path: Path, 
         assert len(error.splitlines()) == 1
 
 
-def test_a_reader_of_the_output_that_has_enough_is_no_mistake(place: Place) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_of_the_output_that_has_enough_is_no_mistake(place: Place, unbuffered: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": SOURCE, "PYTHONUNBUFFERED": unbuffered}
     process = subprocess.Popen([sys.executable, "-m", "rosbridge_eth", "status", "--json"], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": SOURCE})  # fmt: skip
+                               stderr=subprocess.PIPE, env=environment)  # fmt: skip
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
-    assert b"Traceback" not in process.stderr.read()
+    assert process.stderr.read() == b""
     assert process.wait(60) == ExitCode.FAILED
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_that_cannot_be_written_is_one_line(place: Place, unbuffered: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": SOURCE, "PYTHONUNBUFFERED": unbuffered}
+    with open("/dev/full", "w") as full:
+        process = subprocess.run([sys.executable, "-m", "rosbridge_eth", "status", "--json"], stdout=full,
+                                 stderr=subprocess.PIPE, text=True, env=environment, check=False)  # fmt: skip
+    assert (process.returncode, process.stderr) == (ExitCode.FAILED, "rosbridge-eth: No space left on device\n")
 
 
 def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from rosbridge_eth import demo, doctor, status, topics
-from rosbridge_eth.cli import handing, operator, reader, robot
+from rosbridge_eth.cli import operator, reader, robot
 from rosbridge_eth.errors import BridgeError, ExitCode
 from rosbridge_eth.terminal import talk
 from smcrypto import __version__
@@ -31,7 +31,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (demo, operator, robot, topics, reader, handing, status, doctor):
+for part in (demo, operator, robot, topics, reader, status, doctor):
     part.add_commands(app)
 
 
@@ -51,7 +51,10 @@ def _options(
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
-        app(args=None if arguments is None else list(arguments))
+        try:
+            app(args=None if arguments is None else list(arguments))
+        finally:
+            _flush()
     except BridgeError as error:
         talk(f"rosbridge-eth: {error}")
         return int(error.exit_code)
@@ -60,7 +63,6 @@ def run(arguments: Sequence[str] | None = None) -> int:
             talk("rosbridge-eth: interrupted")
         return stop.code if isinstance(stop.code, int) else int(ExitCode.OK)
     except BrokenPipeError:  # `read | head`: whoever took the data has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(ExitCode.FAILED)
     except OSError as error:  # a file or folder given by the user that cannot be read or written, a full disk
         named = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)
@@ -73,3 +75,12 @@ def run(arguments: Sequence[str] | None = None) -> int:
         talk("rosbridge-eth: interrupted")
         return INTERRUPTED
     return int(ExitCode.OK)
+
+
+def _flush() -> None:
+    """What cannot be written is told now: at its end the interpreter would show an exception, and exit with 120."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # where the rest goes at that end
+        raise

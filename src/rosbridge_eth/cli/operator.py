@@ -12,17 +12,20 @@ from urllib.parse import urlsplit
 
 import typer
 
-from rosbridge_eth import terminal
+from rosbridge_eth import status, terminal
+from rosbridge_eth.bundle import Request
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
+from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
-from rosbridge_eth.identity import Role, load_ca
+from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
 from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
+from rosbridge_eth.reading.verdict import grouped
+from rosbridge_eth.registry import Registry
 from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
 if TYPE_CHECKING:
-    from rosbridge_eth.identity import CertificateAuthority
     from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Keyring, Ledger
 
@@ -186,14 +189,14 @@ def init(
     place = OperatorHome(home)
     passphrase = read_passphrase("operator", "Operator passphrase", file=passphrase_file, confirm=True)
     readers = read_passphrase("reader", "Passphrase of the reader `owner`", file=reader_passphrase_file, confirm=True)
-    words = None if mnemonic_file is None else read_passphrase("mnemonic", "Mnemonic", file=mnemonic_file).decode()
+    words = mnemonic_file and read_passphrase("mnemonic", "Mnemonic", file=mnemonic_file).decode()
     keys = init_home(
         place, passphrase, reader=ReaderHome(reader), reader_passphrase=readers, now=utc_now(), listen=listen,
-        public=public, chain_url=chain, server=server_name, ca=ca,
-        ca_passphrase=None if ca_passphrase_file is None
-        else read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file),
-        keys=None if words is None else Keyring.from_mnemonic(words), archive=archive,
-    )  # fmt: skip
+        public=public, chain_url=chain, server=server_name, ca=ca, archive=archive,
+        ca_passphrase=read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file)
+        if ca_passphrase_file else None,
+        keys=Keyring.from_mnemonic(words) if words else None,
+    )
     talk(f"{home} is an operator's home. Keep its passphrase: nothing in it can be recovered without.")
     talk(f"{reader} is the home of the reader `owner`: carry it to the machine that reads; {home} opens no record.")
     talk(f"Robots are told to send to {load_server_config(place.config).address_for_robots()}.")
@@ -204,9 +207,8 @@ def init(
 def chain(
     home: OperatorHomeOption = OPERATOR_HOME,
     port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port on 127.0.0.1.")] = 8545,
-    block_time: Annotated[
-        float | None, typer.Option(min=0.1, help="Seconds between blocks; without it each transaction gets its own.")
-    ] = None,
+    block_time: Annotated[float | None, typer.Option(
+        min=0.1, help="Seconds between blocks; without it each transaction gets its own.")] = None,
     eth: Annotated[int, typer.Option(min=1, help="ETH on the operator's account.")] = 1000,
 ) -> None:
     """Start a local anvil whose chain is kept in the home, and give the operator's account ETH on it."""
@@ -252,15 +254,11 @@ def register(
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
     """
     from rosbridge_eth.administration import register_robot
-    from rosbridge_eth.bundle import Request
-    from rosbridge_eth.files import write_atomically
-    from rosbridge_eth.reading.verdict import grouped
 
     asked = None if request is None else Request.decode(terminal.read_given(request))
     place, passphrase, keys = _opened(home, passphrase_file)
-    secret = None if asked else read_passphrase(
-        "robot", f"Registration password of {name}", file=password_file, confirm=True
-    )  # fmt: skip
+    prompt = f"Registration password of {name}"
+    secret = None if asked else read_passphrase("robot", prompt, file=password_file, confirm=True)
     ca = _ca(place, passphrase, ca_passphrase_file)
     with ledger_of(place) as ledger:
         made = register_robot(
@@ -343,14 +341,11 @@ def renew(
 def export(
     name: Annotated[str, typer.Argument(help="A robot's name, or `operator`.")],
     file: Annotated[Path, typer.Argument(help="The keystore to write.")],
-    home: OperatorHomeOption = OPERATOR_HOME,
-    passphrase_file: PassphraseFile = None,
+    home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     password_file: Annotated[Path | None, typer.Option(help="The keystore's own password.")] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Write an account as a standard keystore that other Ethereum software imports."""
     from rosbridge_eth.administration import OPERATOR
-    from rosbridge_eth.files import write_atomically
-    from rosbridge_eth.registry import Registry
 
     (place, _, keys), number = _opened(home, passphrase_file), 0
     if name != OPERATOR:
@@ -434,7 +429,6 @@ def _serve(
 ) -> None:  # fmt: skip
     """Run the server, with these keys of server.toml changed; what `look` raises ends it in good order."""
     from rosbridge_eth.administration import load_server_identity
-    from rosbridge_eth.status import fleet
     from rosbridge_eth.supervisor import Secrets, Supervisor
 
     config = load_server_config(place.config).model_copy(update=changes)
@@ -443,7 +437,7 @@ def _serve(
     def ready(address: tuple[str, int]) -> None:
         talk(f"Listening on UDP {address[0]}:{address[1]} (workers: {config.workers}); Ctrl-C ends it.")
 
-    with live(lambda: fleet(place)) as show:
+    with live(lambda: status.fleet(place)) as show:
 
         def on_look() -> None:
             show()
@@ -456,15 +450,12 @@ def check(
     robot: Annotated[str, typer.Argument(help="The robot's name.")],
     stream: Annotated[str, typer.Argument(help="The chunk's stream: 32 hex digits, as `read` shows it.")],
     number: Annotated[int, typer.Argument(min=0, help="The chunk's number in the stream.")],
-    home: OperatorHomeOption = OPERATOR_HOME,
-    json: terminal.Json = False,
-) -> None:
+    home: OperatorHomeOption = OPERATOR_HOME, json: terminal.Json = False,
+) -> None:  # fmt: skip
     """Where is this chunk? Asks the inbox and the chain, and of one in a block the contract itself (checkData)."""
-    from rosbridge_eth.status import locate
-
     place = OperatorHome(home).require()
     with ledger_of(place) as ledger:
-        found = locate(place, ledger, robot, stream, number)
+        found = status.locate(place, ledger, robot, stream, number)
     if json:
         terminal.print_json(found._asdict())
     else:

@@ -1,4 +1,5 @@
-"""`read` and `compare`: what a robot wrote, proven, from the chain alone."""
+"""`read` and `compare`: what a robot wrote, proven, from the chain alone; `evidence`, `verify` and `grant`: what a
+reader hands to others, and how they check it."""
 
 from __future__ import annotations
 
@@ -9,24 +10,27 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
-from datetime import datetime
+from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import typer
 
-from rosbridge_eth.config import load_reader_config
+from rosbridge_eth.config import ReaderConfig, load_reader_config
+from rosbridge_eth.config.models import ArchiveConfig
 from rosbridge_eth.config.values import Address, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
+from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import ReaderHome
+from rosbridge_eth.identity import Identity, Role, Trust, load_identity, public_identity, read_certificates
 from rosbridge_eth.passphrases import read_passphrase
-from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, talk
+from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading, Verdict, read_robot
+from rosbridge_eth.reading.verdict import shown
+from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
 
 if TYPE_CHECKING:
-    from rosbridge_eth.config import ReaderConfig
-    from rosbridge_eth.identity import Identity, Trust
     from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading
     from rosbridge_eth.reading.verify import Bodies
 
 
@@ -36,42 +40,37 @@ def add_commands(app: typer.Typer) -> None:
         " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
     )(read)
     app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
+    app.command(
+        epilog="Example: rosbridge-eth grant robot_1 --from 2026-11-21T10:00:00Z --to 2026-11-21T10:05:00Z"
+        " --reader insurer.pem"
+    )(grant)
+    app.command(epilog="Example: rosbridge-eth evidence robot_1 crash.html --at 2026-11-21T10:00:00Z")(evidence)
+    app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
 
 
 RobotName: TypeAlias = Annotated[str, typer.Argument(help="The robot's name.")]
 Topic: TypeAlias = Annotated[str | None, typer.Option(help="Only this topic.")]
-From: TypeAlias = Annotated[
-    str | None, typer.Option("--from", help="Only what was received from this time on.")
-]
+From: TypeAlias = Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")]
 To: TypeAlias = Annotated[str | None, typer.Option(help="Only what was received before this time.")]
-At: TypeAlias = Annotated[
-    str | None, typer.Option(help="Only the last record of each topic up to this moment.")
-]
-Nodes: TypeAlias = Annotated[
-    list[str] | None, typer.Option("--node", help="Ask these nodes, not those of reader.toml.")
-]
-ArchiveUrl: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--archive", help="Fetch archived bodies there, not where reader.toml says: folder, s3://…, or `no`."),
-]
-Confirmations: TypeAlias = Annotated[
-    int, typer.Option(min=1, max=100_000, help="Read up to the block that has so many, itself counted.")
-]
-Confirm: TypeAlias = Annotated[
-    bool, typer.Option("--confirm", help="The fingerprints of new certificates are compared and right.")
-]
+At: TypeAlias = Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")]
+Nodes: TypeAlias = Annotated[list[str] | None, typer.Option(
+    "--node", help="Ask these nodes, not those of reader.toml.")]
+ArchiveUrl: TypeAlias = Annotated[str | None, typer.Option(
+    "--archive", help="Fetch archived bodies there, not where reader.toml says: folder, s3://…, or `no`.")]
+Confirmations: TypeAlias = Annotated[int, typer.Option(
+    min=1, max=100_000, help="Read up to the block that has so many, itself counted.")]
+Confirm: TypeAlias = Annotated[bool, typer.Option(
+    "--confirm", help="The fingerprints of new certificates are compared and right.")]
 
 
 def _time(text: str | None) -> int | None:
     try:
-        return None if text is None else parse_time(datetime.fromisoformat(text))
+        return None if text is None else parse_time(text)
     except ValueError as error:
         raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
 
 
-def choice_of(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
-    from rosbridge_eth.reading import Choice
-
+def _choice_of(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
     choice = Choice(topic, _time(from_), _time(to), _time(at))
     if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
         raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
@@ -89,28 +88,18 @@ def _address(text: str | None) -> Address | None:
 
 def read(
     robot: Annotated[list[str], typer.Argument(metavar="ROBOT", help="The robot's name; several with --serve.")],
-    home: ReaderHomeOption = READER_HOME,
-    topic: Topic = None,
-    from_: From = None,
-    to: To = None,
-    at: At = None,
+    home: ReaderHomeOption = READER_HOME, topic: Topic = None, from_: From = None, to: To = None, at: At = None,
     bag: Annotated[Path | None, typer.Option(help="Write NAME.bag (ROS 1), NAME.mcap, NAME.db3 or a folder.")] = None,
     table: Annotated[Path | None, typer.Option(help="Write NAME.csv or NAME.parquet.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw the trajectory: .png, .svg or .pdf.")] = None,
-    field: Annotated[
-        list[str] | None, typer.Option(help="Draw this field over time instead, such as pose.pose.position.x.")
-    ] = None,
+    field: Annotated[list[str] | None, typer.Option(
+        help="Draw this field over time instead, such as pose.pose.position.x.")] = None,
     follow: Annotated[bool, typer.Option("--follow", help="Go on as blocks come, until Ctrl-C.")] = False,
-    serve: Annotated[
-        str | None, typer.Option(metavar="[HOST:]PORT", help="With --follow: show it on a page, on this machine.")
-    ] = None,
-    node: Nodes = None,
-    archive: ArchiveUrl = None,
-    confirmations: Confirmations = 1,
-    confirm: Confirm = False,
-    passphrase_file: PassphraseFile = None,
-    json: Json = False,
-) -> None:
+    serve: Annotated[str | None, typer.Option(
+        metavar="[HOST:]PORT", help="With --follow: show it on a page, on this machine.")] = None,
+    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None, json: Json = False,
+) -> None:  # fmt: skip
     """Fetch a robot's log from the chain, prove it, open it, and give its records as JSON lines, bag, table or plot.
 
     What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
@@ -119,7 +108,7 @@ def read(
     """
     from rosbridge_eth.reading import outputs
 
-    choice, robot = choice_of(topic, from_, to, at), [*dict.fromkeys(robot)]
+    choice, robot = _choice_of(topic, from_, to, at), [*dict.fromkeys(robot)]
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     address = _address(serve)
@@ -148,7 +137,7 @@ def read(
         else:
             [name] = robot
             reading, of_it = stack.enter_context(
-                reading_of(place, name, node, archive, confirmations, confirm, passphrase_file)
+                _reading_of(place, name, node, archive, confirmations, confirm, passphrase_file)
             )
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
@@ -176,9 +165,9 @@ def read(
         of = made.summary
         talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
     if not follow and not chosen[name]:
-        tell_topics(topic, reading)
+        _tell_topics(topic, reading)
     for name, of_it in said.items():
-        require_sound(place, name, of_it)
+        _require_sound(place, name, of_it)
     if plot is not None and not picture.draw(plot):
         what = "a number there" if field else "a position"
         raise ConfigError(f"{plot} shows nothing: none of the {sum(chosen.values())} chosen records holds {what}")
@@ -189,16 +178,11 @@ def compare(
     robot: RobotName,
     home: ReaderHomeOption = READER_HOME,
     topic: Annotated[list[str] | None, typer.Option(help="Only these topics; each must be on the chain.")] = None,
-    some: Annotated[
-        bool, typer.Option("--some", help="The robot captures only some messages: those it does not are no difference.")
-    ] = False,
-    node: Nodes = None,
-    archive: ArchiveUrl = None,
-    confirmations: Confirmations = 1,
-    confirm: Confirm = False,
-    passphrase_file: PassphraseFile = None,
-    json: Json = False,
-) -> None:
+    some: Annotated[bool, typer.Option(
+        "--some", help="The robot captures only some messages: those it does not are no difference.")] = False,
+    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None, json: Json = False,
+) -> None:  # fmt: skip
     """Hold a recording of your own against what the chain has of the same messages, field by field.
 
     Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
@@ -207,7 +191,7 @@ def compare(
 
     place = ReaderHome(home).require()
     choice = comparing.time_of(bag)
-    with reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
+    with _reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
         made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
         said |= asdict(made)
     if json:
@@ -219,15 +203,123 @@ def compare(
     if made.absent:
         talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
     talk(f"{made.equal:,} records are equal to the bag's; {made.wrong:,} differences")
-    require_sound(place, robot, said)
+    _require_sound(place, robot, said)
     if made.wrong or not made.equal:
         raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
+
+
+def evidence(
+    robot: RobotName,
+    file: Annotated[Path, typer.Argument(help="The file to write; as a page that checks itself if it ends in .html.")],
+    home: ReaderHomeOption = READER_HOME, topic: Topic = None, from_: From = None, to: To = None, at: At = None,
+    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None,
+) -> None:  # fmt: skip
+    """Write one file that proves chosen records to somebody who has neither key nor node. It opens nothing else.
+
+    Exits with 9, like read, where the log that they are from is not sound; the file is written nevertheless.
+    """
+    from rosbridge_eth.reading import evidence as making
+
+    choice = _choice_of(topic, from_, to, at)
+    if choice == _choice_of(None, None, None, None):
+        raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
+    if file.exists() or not file.parent.is_dir():
+        raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
+    place = ReaderHome(home).require()
+    with _reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
+        records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
+        for _ in reading.chunks:
+            continue  # the verdict is on all of the log
+        if not records:
+            _tell_topics(topic, reading)
+            raise ConfigError("no record was chosen; nothing is written")
+        made = making.make(reading, records)
+    write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
+    talk(f"{file}: {len(made.records):,} records, for `verify {file} --ca ca.crt.pem`; who has it can read them")
+    _require_sound(place, robot, said)
+
+
+def verify(
+    file: Annotated[Path, typer.Argument(help="What `evidence` wrote, JSON or page.")],
+    ca: Annotated[Path, typer.Option(help="The CA's certificate (PEM): from the operator, not from who has the file.")],
+    node: Annotated[str | None, typer.Option(help="Ask this node whether the blocks are its chain's.")] = None,
+    json: Json = False,
+) -> None:
+    """Check evidence, without a node: what it shows goes to stdout as JSON lines, and what that proves is said.
+
+    Exits with 9 where anything does not hold, with 7 where the node named does not answer.
+    """
+    from rosbridge_eth.reading import evidence as checking
+
+    data = read_given(file, checking.MAX_FILE + 1)
+    given = checking.Evidence.read(data)
+    found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
+    if node is not None:
+        checking.ask(found, node)
+        talk(f"holds: all {len(found.blocks)} blocks are those of the chain, says {node}")
+    if json:
+        print_json(found.as_json())
+    else:
+        for record in found.records:
+            print(record.json_line(), end="")
+    talk("What this proves:")
+    for line in found.proves():
+        talk(f"- {line}")
+    talk("What it does not prove:")
+    for line in found.proves_not("" if node is None else node):
+        talk(f"- {line}")
+    if data.strip().decode() not in (given.encode(), given.page().strip()):
+        talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
+
+
+def grant(
+    robot: RobotName,
+    from_: Annotated[str, typer.Option("--from", help="Chunks that hold a message received from this time on,")],
+    to: Annotated[str, typer.Option(help="and before this time. Everything in these chunks is opened.")],
+    reader: Annotated[str, typer.Option(help="For whom: that reader's public.pem, or NAME for readers/NAME.pem.")],
+    out: Annotated[Path | None, typer.Option(help="The file to write; ROBOT-NAME.grant without it.")] = None,
+    home: ReaderHomeOption = READER_HOME,
+    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    passphrase_file: PassphraseFile = None,
+) -> None:  # fmt: skip
+    """Hand the keys of a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
+
+    They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
+    """
+    from rosbridge_eth.reading import grant as granting
+
+    choice, place = _choice_of(None, from_, to, None), ReaderHome(home).require()
+    known = place.path / "readers" / f"{reader}.pem"
+    peer = public_identity(read_given(known if known.exists() else Path(reader)))
+    now = datetime.now(UTC)
+    with _asking(place, node, archive, confirmations, passphrase_file) as asked:
+        certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
+        peer = asked.trust.check(*certificates, role=Role.READER, at=now)
+        out = out or Path(f"{robot}-{peer.name}.grant")
+        if out.exists():
+            raise ConfigError(f"{out} is there already; name another with --out")
+        with _reading_as(asked, robot, confirm) as (reading, said):
+            keys = granting.keys_of(reading, choice)
+        if not keys:
+            raise ConfigError(f"this reader can open nothing of {robot} that was received in that time; see above")
+        made = granting.make(
+            keys, ledger=reading.verifier.log.ledger, robot=robot, begin=from_, end=to, by=asked.identity, to=peer,
+            now=now,
+        )  # fmt: skip
+    write_atomically(out, made, new=True)
+    chunks = f"{len(keys):,} chunk{'s' * (len(keys) > 1)}"
+    talk(f"{out} opens {chunks} of {robot} for reader {peer.name}, and for nobody else.")
+    talk(f"Whoever has {peer.name}'s home puts it into `grants/` there and runs: rosbridge-eth read {robot}")
+    _require_sound(place, robot, said)
+
+
+# What the commands share
 
 
 def _bodies(config: ReaderConfig, given: str | None) -> Bodies | None:
     """What gives the bodies of archived chunks: the archive that was given or that of reader.toml, or nothing."""
     from rosbridge_eth.archive import open_archive
-    from rosbridge_eth.config.models import ArchiveConfig
 
     archive = config.archive
     if given is not None and given != "no":
@@ -250,12 +342,10 @@ class _Asked(NamedTuple):
 
 
 @contextmanager
-def asking(
+def _asking(
     place: ReaderHome, nodes: Sequence[str] | None, archive: str | None, confirmations: int, file: Path | None
 ) -> Iterator[_Asked]:
-    from rosbridge_eth.identity import Trust, load_identity
     from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.reading import Bookmarks, read_robot
     from rosbridge_eth.reading.grant import open_folder
 
     config = load_reader_config(place.config)
@@ -279,25 +369,30 @@ def asking(
 
 
 @contextmanager
-def reading_of(
+def _reading_of(
     place: ReaderHome, robot: str, nodes: Sequence[str] | None, archive: str | None, confirmations: int,
     confirm: bool, file: Path | None,
 ) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    with asking(place, nodes, archive, confirmations, file) as asked, reading_as(asked, robot, confirm) as found:
+    with _asking(place, nodes, archive, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
         yield found
 
 
 @contextmanager
-def reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
+def _reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
     """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
     said = dict[str, Any]()
     with closing(asked.read(robot, now=time.time())) as reading:
         yield reading, said
         verdict = reading.verdict()
     reading.keep(asked.bookmarks, confirm=confirm)
-    said |= verdict.as_json()
+    said |= _say(verdict)
+
+
+def _say(verdict: Verdict) -> dict[str, Any]:
+    """Say it; the verdict as JSON."""
     for line in verdict.lines():
         talk(line)
+    return verdict.as_json()
 
 
 @contextmanager
@@ -313,7 +408,7 @@ def _following(
     from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
+    with _asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
         followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
         following = Following(followed, asked.ledgers)
         view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)
@@ -348,22 +443,17 @@ def _following(
     for robot in following.robots:
         if robot.reading is None:  # as with a `read` that is interrupted
             raise ChainError(f"{robot.name}: {robot.trouble}") if robot.trouble else KeyboardInterrupt
-        verdict = robot.reading.verdict()
-        said[robot.name] = verdict.as_json()
-        for line in verdict.lines():
-            talk(line)
+        said[robot.name] = _say(robot.reading.verdict())
 
 
-def tell_topics(topic: str | None, reading: Reading) -> None:
+def _tell_topics(topic: str | None, reading: Reading) -> None:
     """Nothing was chosen: what there is, for who named a topic that is not there."""
-    from rosbridge_eth.reading.verdict import shown
-
     if topic is not None and topic not in reading.topics:
         there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
         talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
 
 
-def require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
+def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
     if not said["sound"]:
         raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
     if not said["records"] and "no-grant" in said["counts"]:

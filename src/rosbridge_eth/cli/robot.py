@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import FrameType
@@ -98,8 +98,7 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
     if not topics or isinstance(config.source, BagConfig):  # a bag is there already, or it is a slip of the pen
         with closing(everything(config)) as opened:
             offers = [] if topics else offered(opened)
-    if not topics:
-        topics = sorted({offer.topic for offer in offers} - PLUMBING)
+        topics = topics or sorted({offer.topic for offer in offers} - PLUMBING)
         if asks and offers:
             topics = _choose(offers, topics)
     if not topics:
@@ -146,10 +145,9 @@ def _say_who(fingerprint: str) -> None:
 def robot(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
     config: Annotated[Path | None, typer.Option(help="Use this file instead of robot.toml.")] = None,
-    password_file: terminal.PasswordFile = None,
-    verbose: terminal.Verbose = 0,
+    password_file: terminal.PasswordFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
-) -> None:
+) -> None:  # fmt: skip
     """Watch the configured topics and bring what they say to the server, until stopped or the source ends.
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
@@ -189,11 +187,11 @@ def robot(
             web.start()
             stack.callback(web.stop)
         talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
-        beats, rates, first = Beats(), metrics.Rates(), _first(running)
+        beats, rates, told = Beats(), metrics.Rates(), not errors.is_terminal
         show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
 
         def on_turn() -> None:
-            nonlocal settings
+            nonlocal settings, told
             if again.is_set():
                 again.clear()
                 settings = read_again(running, place, settings, file)
@@ -205,7 +203,10 @@ def robot(
                     notify("WATCHDOG=1")
                     for name in _asked_for(place, running.box.triggers):
                         running.fire("asked for", name)
-                    first()
+                    newest = running.sender.statistics.newest
+                    if not told and newest is not None and newest.stream == running.writer.stream:
+                        told = True
+                        talk(f"The first record is in block {newest.block}{' or before' if newest.number else ''}.")
                     metrics.show_robot(end.robot, running, time.time())
                 show()
 
@@ -248,19 +249,6 @@ def _asked_for(place: RobotHome, triggers: Iterable[str]) -> list[str]:
     for name in asked:
         place.event(name).unlink(missing_ok=True)
     return asked
-
-
-def _first(running: Robot) -> Callable[[], None]:
-    """What tells a person at the terminal, once, that the first record of this run is on the chain."""
-    told: list[int] = []
-
-    def tell() -> None:
-        newest = running.sender.statistics.newest
-        if errors.is_terminal and not told and newest is not None and newest.stream == running.writer.stream:
-            told.append(newest.block)
-            talk(f"The first record is in block {newest.block}{' or before' if newest.number else ''}.")
-
-    return tell
 
 
 def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:

@@ -28,6 +28,7 @@ from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import ExitCode
+from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
@@ -328,7 +329,7 @@ def test_how_much_room_is_enough(monkeypatch: Patch, tmp_path: Path, free: int, 
     fake = os.statvfs_result((4096, 4096, 0, 0, free // 4096, 1000, inodes, inodes, 0, 255))
     assert type(found) is type(fake)
     monkeypatch.setattr(os, "statvfs", lambda path: fake)
-    [finding] = checks.disk(tmp_path, None)
+    [finding] = checks.disk(RobotHome(tmp_path), None)
     assert finding.result == (result if inodes else "broken")
 
 
