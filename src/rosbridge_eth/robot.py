@@ -26,7 +26,7 @@ from rosbridge_eth.blackbox import BlackBox, Record
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
-from rosbridge_eth.chunk import MAX_READERS, Chunk, Log, drop, robot_id
+from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.values import parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
@@ -350,10 +350,6 @@ def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certi
         born = max(signing.not_before, encryption.not_before)
         peer = trust.check(signing.to_der(), encryption.to_der(), role=Role.READER, at=born)
         keys.append(peer.encryption_certificate.public_key)
-    if len(keys) > MAX_READERS:
-        raise ConfigError(
-            f"there are {len(keys)} readers, and a chunk is for {MAX_READERS} at most; people may share a reader's key"
-        )
     return keys
 
 

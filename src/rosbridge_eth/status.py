@@ -42,6 +42,8 @@ Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
 FEW_DAYS = 7.0
 Figure = tuple[str, dict[str, str], float]
+_NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
+_SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
              "chain_block": "block", "on_hold": "hold", "waiting_chunks": "chunks", "waiting_seconds": "oldest"}
 """The server's figures of a robot, and what they are called here."""
@@ -119,16 +121,21 @@ def _asking(report: Report, what: str) -> Iterator[None]:
         report["unknown"].append(f"{what}: {error}")
 
 
-def _running(report: Report, home: Path, expected: Collection[str], whose: str) -> list[Figure]:
-    """What the running process of this home shows: its figures; in the report, the conditions that do not hold."""
+def _running(report: Report, home: Path, otherwise: str, expected: Collection[str] = ()) -> list[Figure]:
+    """What the running processes of this home show; in the report, the conditions that do not hold.
+
+    expected: the processes; of a server those that it has started. otherwise: said where none of them beats.
+    """
     from rosbridge_eth import metrics
+    from rosbridge_eth.supervisor import MONITOR
 
     report["process"], found, holds = None, list[Figure](), dict[str, bool]()
     with suppress(ValueError):  # nothing runs
-        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
         found = metrics.figures(home)
+        expected = expected or {of["process"] for name, of, _ in found if name == "starts"} - {MONITOR}
+        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
     if not any(holds.get(f"{process} runs") for process in expected):  # or what a killed one left
-        report["unknown"].append(f"the {whose} does not run here: who is connected, rates and gas are not known")
+        report["unknown"].append(otherwise)
         return []
     report["process"] = [name for name, so in holds.items() if not so]
     return found
@@ -159,12 +166,6 @@ def _head(report: Report, ledger: Ledger) -> None:
         raise
 
 
-def _server_processes(config: ServerConfig) -> list[str]:
-    from rosbridge_eth.supervisor import SUBMITTER, worker_name
-
-    return [SUBMITTER, *map(worker_name, range(config.workers))]
-
-
 def _operator(place: OperatorHome) -> Report:
     from rosbridge_eth.ledger import Ledger
 
@@ -182,7 +183,7 @@ def _operator(place: OperatorHome) -> Report:
         "operator": {"account": place.account, "eth": None, "days_left": None}, "contract": None, "node": None,
         "gas_per_day": config.funds.gas_per_day, "dead": [], "unknown": [],
     }  # fmt: skip
-    _add_figures(report, _running(report, place.path, _server_processes(config), "server"))
+    _add_figures(report, _running(report, place.path, _NO_SERVER))
     with _asking(report, "the contract"):
         deployment = place.deployment()
         report |= {"contract": deployment.contract, "chain": deployment.chain_id}
@@ -205,10 +206,9 @@ def fleet(place: OperatorHome) -> RenderableType:
         with Registry(place.registry) as registry:
             report["robots"] = {robot.name: {"in_force": True} for robot in registry.robots().values()
                                 if robot.revoked_at is None}  # fmt: skip
-        processes = _server_processes(load_server_config(place.config))
     except BridgeError as error:  # of a file that is changed at this moment
         return Text(str(error))
-    _add_figures(report, _running(report, place.path, processes, "server"))
+    _add_figures(report, _running(report, place.path, _NO_SERVER))
     return Group(_robots(report, money=False), *map(Text, _alarms(report)))
 
 
@@ -282,7 +282,7 @@ def _robot(place: RobotHome) -> Report:
                       "trigger_records")  # fmt: skip
             report["figures"] = {
                 " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in _running(report, place.path, ["robot"], "robot") if name in wanted
+                for name, labels, value in _running(report, place.path, _SILENT, ["robot"]) if name in wanted
             }  # fmt: skip
     return report
 

@@ -151,6 +151,18 @@ def test_another_reader_is_made_carried_and_given_to_a_robot(place: Place, capsy
         assert [reader.name for reader in registry.readers()] == ["owner"]
 
 
+def test_a_node_that_confirms_evidence_is_named_without_its_keys(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    vectors = Path(__file__).resolve().parents[1] / "vectors" / "evidence"
+    monkeypatch.setattr("rosbridge_eth.reading.evidence.ask", lambda found, node: None)
+    url = "https://user:node-key@rpc.example:8545/path-key?token=query-key"
+    assert run(["verify", str(vectors / "span.json"), "--ca", str(vectors / "ca.crt.pem"), "--node", url]) == 0
+    said = capsys.readouterr().err
+    assert said.count("https://rpc.example:8545 ") + said.count("https://rpc.example:8545\n") == 2
+    assert not any(secret in said for secret in ("node-key", "path-key", "query-key"))
+
+
 def test_what_is_said_is_never_markup(capsys: Capture) -> None:
     terminal.talk("[red]what a stranger[/red] says [/]")
     assert capsys.readouterr().err == "[red]what a stranger[/red] says [/]\n"

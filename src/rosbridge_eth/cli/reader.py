@@ -250,6 +250,7 @@ def verify(
 
     Exits with 9 where anything does not hold, with 7 where the node named does not answer.
     """
+    from rosbridge_eth.ledger.transport import shown as shown_url
     from rosbridge_eth.reading import evidence as checking
 
     data = read_given(file, checking.MAX_FILE + 1)
@@ -257,6 +258,7 @@ def verify(
     found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
     if node is not None:
         checking.ask(found, node)
+        node = shown_url(node)
         talk(f"holds: all {len(found.blocks)} blocks are those of the chain, says {node}")
     if json:
         print_json(found.as_json())

@@ -492,8 +492,8 @@ class RobotConfig(Section):
             )
         if len(files) > MAX_READERS:
             raise ConfigError(
-                f"{len(files)} readers are too many, a chunk is for {MAX_READERS} at most; take certificates out of"
-                f" {joined if self.readers is None else '`readers`'}, and let more people share a reader's key"
+                f"there are {len(files)} readers, and a chunk is for {MAX_READERS} at most; people may share a reader's"
+                " key"
             )
         return files
 

@@ -345,7 +345,7 @@ def test_more_readers_than_a_chunk_is_for_are_told_before_anything_is_sealed(tmp
         (tmp_path / f"{number}.pem").write_text("")
     assert len(config.reader_files(tmp_path)) == MAX_READERS
     (tmp_path / "more.pem").write_text("")
-    with pytest.raises(ConfigError, match="17 readers are too many, a chunk is for 16"):
+    with pytest.raises(ConfigError, match="there are 17 readers, and a chunk is for 16 at most"):
         config.reader_files(tmp_path)
 
 

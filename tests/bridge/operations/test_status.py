@@ -196,7 +196,10 @@ def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: P
 
 def test_who_is_connected_and_what_comes_from_them_is_what_the_running_server_shows(place: Place, capsys: Capture):
     now = time.time()
+    place.configure('name = "server"', 'name = "server"\nworkers = 2')  # since it was started, with one
     with metrics.shared(place.operator.path):
+        for process in ("submitter", "worker-0", "monitor"):
+            metrics.STARTS.labels(process).set(1)
         metrics.beat("worker-0", now)
         metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
         metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
@@ -210,7 +213,7 @@ def test_who_is_connected_and_what_comes_from_them_is_what_the_running_server_sh
         robot = report["robots"]["robot_1"]
         assert (robot["connected"], robot["address"]) == (True, "192.0.2.2") and "robot_2" not in report["robots"]
         assert (robot["rate"], robot["gas"]) == (12.5, 123_000) and 30 <= robot["newest"] < 60
-        assert "submitter runs" in report["process"], "it has not beaten"
+        assert report["process"] == ["submitter runs"], "it has not beaten"
         metrics.beat("submitter", now)
         metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
         metrics.CONDITION.labels("node answers").set(0)
@@ -233,6 +236,7 @@ def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Pla
     screen = Console(width=100, record=True, file=io.StringIO())
     with metrics.shared(place.operator.path):
         for process in ("worker-0", "submitter"):
+            metrics.STARTS.labels(process).set(1)
             metrics.beat(process, time.time())
         metrics.SESSION.labels("robot_1", "192.0.2.2").set(time.time())
         metrics.WAITING.labels("robot_1").set(7)
@@ -266,7 +270,8 @@ def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys:
             robot.spool.append(chunk)
         report = status(capsys, "--home", "robot")
         assert (report["kind"], report["robot"], report["runs"], report["spool"]) == ("robot", "robot_1", True, None)
-        assert any("does not run here" in line for line in report["unknown"]), "it shows no figures"
+        assert any("shows no figures" in line for line in report["unknown"])
+        assert not any("does not run" in line for line in report["unknown"]), "it does, or something that has its spool"
     finally:
         robot.spool.close()
         robot.loop.close()
