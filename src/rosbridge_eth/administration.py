@@ -463,7 +463,7 @@ def revoke(
         in_force = registry.revoke(role, name, now)
     nobody = f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
     if role is not Role.ROBOT:
-        if known:  # also where it was cut short before
+        if known and role is Role.READER:  # also where it was cut short before
             (home.readers / f"{name}.pem").unlink(missing_ok=True)
         if not in_force:
             raise IdentityError(nobody)

@@ -94,9 +94,8 @@ class Fees(NamedTuple):
     tip: int | None
 
     def at_least(self, other: Fees) -> Fees:
-        if self.tip is None or other.tip is None:
-            return Fees(max(self.highest, other.highest), None)
-        return Fees(max(self.highest, other.highest), max(self.tip, other.tip))
+        tip = None if self.tip is None or other.tip is None else max(self.tip, other.tip)
+        return Fees(max(self.highest, other.highest), tip)
 
     def raised(self) -> Fees:
         """An eighth more of both; nodes ask for a tenth more to replace a transaction."""
@@ -352,11 +351,9 @@ class Ledger:
             if not found or found[-1].block != block:
                 raise ChainError(f"{self.url} has no batch of this robot in block {block}, where one must be")
             yield from reversed(found)
-            if found[0].previous_block >= found[0].block:
-                raise ChainError(
-                    f"{self.url} names a batch before that of block {found[0].block} which is not before it"
-                )
-            block, span = found[0].previous_block, min(2 * span, most)
+            if (oldest := found[0]).previous_block >= oldest.block:
+                raise ChainError(f"{self.url} names a batch before that of block {oldest.block} which is not before it")
+            block, span = oldest.previous_block, min(2 * span, most)
 
     def registrations(self, tk: bytes, standing: Standing) -> list[RegistrationEvent]:
         """All of the robot's registrations and revocations up to `standing`, oldest first, by their links."""

@@ -300,7 +300,11 @@ class Submitter:
             (w, nonce) for w, nonce, then in zip(work, nonces, second, strict=True)
             if (w.standing.chunks, w.standing.tail) == (then.chunks, then.tail)
         ]  # fmt: skip
-        room = 2 * head.gas_limit - sum(f.gas for account in self._known.values() for f in account.flights)
+        # What no pool took, as of a robot without money, needs no room.
+        room = 2 * head.gas_limit - sum(
+            batch.gas for w, (latest, pending) in zip(work, nonces, strict=True)
+            for batch in self._known[w.tk].flights[: max(pending - latest, 0)]
+        )  # fmt: skip
         outbox: list[tuple[Account, Fees, bytes]] = []
         for w, (latest, pending) in sorted(steady, key=lambda item: item[0].oldest):
             account = self._known[w.tk]

@@ -578,6 +578,15 @@ def test_a_revocation_of_a_reader_that_was_cut_short_is_done_again(
         world.revoke("later", Role.READER)
 
 
+def test_a_server_of_a_readers_name_is_revoked_without_it(world: World, tmp_path: Path) -> None:
+    ca = load_ca(world.home.ca, PASSPHRASE, NOW)
+    admin.add_reader(world.home, "server", ReaderHome(tmp_path / "r"), ca=ca, passphrase=PASSPHRASE, now=NOW)
+    world.revoke("server", Role.SERVER)
+    assert (world.home.readers / "server.pem").exists()
+    with registry(world) as known:
+        assert known.find("reader", "server") and not known.find("server", "server")
+
+
 def test_an_archive_that_is_named_is_made_and_told_to_readers(tmp_path: Path):
     home, reader = OperatorHome(tmp_path / "operator"), ReaderHome(tmp_path / "owner")
     keys = admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=PASSPHRASE, now=NOW,

@@ -530,6 +530,23 @@ def test_an_empty_treasury_is_said_and_nothing_is_dropped(tmp_path: Path):
     assert world.submitter.funds is None
 
 
+def test_robots_without_money_take_no_room_from_one_that_has_some(tmp_path: Path):
+    world = World(tmp_path, robots=3)
+    *broke, rich = world.pens
+    world.model.state.balances[OPERATOR] = 0
+    for pen in broke:
+        world.model.state.balances[pen.account.address] = 0
+        world.take(pen.chunks(120, 8_000), pen)
+    world.turn()
+    world.take(rich.chunks(100, 8_000), rich)
+    for _ in range(20):
+        world.turn(mine=1)
+    assert world.on_chain(rich) == rich.digests
+    world.model.state.balances[OPERATOR] = 10 * ETH
+    world.run()
+    assert world.model.reverted == 0
+
+
 def test_what_is_said_of_the_treasury_ends_with_the_work_that_needed_it(tmp_path: Path):
     world = World(tmp_path, wei=ETH // 100)
     world.model.state.balances[OPERATOR] = 0
