@@ -73,7 +73,8 @@ class Folder(Archive):
 
     def put(self, digest: bytes, body: bytes) -> None:
         with self._using(digest) as path:
-            if path.parent.name not in self._synced:  # whoever made it may not have come to that
+            # Whoever made it may not have come to that; and who copied it elsewhere may have removed it since.
+            if path.parent.name not in self._synced or not path.parent.is_dir():
                 path.parent.mkdir(exist_ok=True)
                 folder = os.open(self._path, os.O_RDONLY)
                 try:

@@ -83,7 +83,7 @@ class Robot:
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
         self._spool_at = self._losses_at = self._synchronised_at = float("-inf")
-        self._synchronised = False
+        self._synchronised = self._finished = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
         self.spool_trouble = Trouble(log, "the spool")
@@ -105,6 +105,9 @@ class Robot:
         """An event of this trigger, or of all, by hand; to be called in the loop's thread."""
         replayed = 0 if self.source.live else self.box.newest_ns
         self.box.fire(replayed or time.time_ns(), why, name)
+        if self._finished and self.box.released:  # the source has ended, and with it the stream
+            self._finished = False
+            self.writer.new_stream()
 
     @property
     def lost(self) -> dict[tuple[str, str], int]:
@@ -142,26 +145,24 @@ class Robot:
         """
         reading = threading.Thread(target=self._read, name="source", daemon=True)
         reading.start()
-        finished = False
         try:
             while not self._stop.is_set():
                 now = time.monotonic()
                 self._take(now)
-                if not finished and self._source_ended.is_set() and not self._ring and not self.box.released:
-                    finished = True
+                if not self._finished and self._source_ended.is_set() and not self._ring and not self.box.released:
                     self._finish(now)
                 else:
-                    self._spool_chunks([] if finished else self.writer.closed(now, time.time_ns() // 10**6), now)
+                    self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
                 self._spool_or(None, self.sender.send)
                 on_turn()
-                if finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
+                if self._finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
                     break
-                self.loop.step(self._wait(now, finished))
+                self.loop.step(self._wait(now))
             else:
                 while (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
                     self._take(now := time.monotonic())
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
-                if not finished:
+                if not self._finished:
                     self._finish(time.monotonic())
                 self._spool_at = float("-inf")  # the last chunks do not wait
                 self._spool_chunks([], time.monotonic())
@@ -248,6 +249,7 @@ class Robot:
             self.writer.add(line, now)
 
     def _finish(self, now: float) -> None:
+        self._finished = True
         self._add_losses(now)
         self._spool_chunks(self.writer.finish(time.time_ns() // 10**6), now)
 
@@ -272,10 +274,10 @@ class Robot:
         else:
             self.spool_trouble.now(None)
 
-    def _wait(self, now: float, finished: bool) -> float:
+    def _wait(self, now: float) -> float:
         if (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
             return 0.0
-        due = LONGEST_WAIT if finished else self.writer.next_timer() - now
+        due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
         return max(0.0, min(LONGEST_WAIT, due))
 
     def _last_words(self) -> None:

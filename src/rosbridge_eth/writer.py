@@ -71,7 +71,7 @@ class LogWriter:
         self.new_stream()
 
     def new_stream(self) -> None:
-        """Begin another stream, after the server refused the present one; lines in no chunk yet go into it."""
+        """Begin another stream, after the server refused the present one or it ended; lines in no chunk go into it."""
         self.stream = self._randomness(chunk.STREAM_SIZE)
         self._number = 0
         self._defined: dict[str, bytes] = {}  # what the stream said last of a type
@@ -117,7 +117,7 @@ class LogWriter:
         return chunks
 
     def finish(self, wall_ms: int) -> list[Chunk]:
-        """The rest; the last chunk says goodbye, and the writer is of no use any more."""
+        """The rest; the last chunk says goodbye. What may come after it takes a new stream."""
         chunks: list[Chunk] = []
         while self._archive.waiting:
             chunks += self._seal_next(self._archive, wall_ms)

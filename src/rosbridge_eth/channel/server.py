@@ -296,6 +296,8 @@ class Server:
                 self._counts[refused.drop] += 1
                 address, hello = half_open.key
                 del self._half_open[half_open.key]
+                if refused.hint is Reason.FULL:  # no failure of the source's
+                    self._sources.give_back(address)
                 if refused.hint is not None:
                     self._outbox.append((hello.datagram(Kind.REFUSAL, bytes((refused.hint,))), address))
             self._share.charge(self._stopwatch() - began)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.server
 import os
 import random
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -77,6 +78,14 @@ def test_a_folder_that_is_not_there_is_not_made_and_not_empty(tmp_path: Path) ->
         with pytest.raises(StoreError, match="mount it"):
             call()
     assert not (tmp_path / "not mounted").exists()
+
+
+def test_what_somebody_removed_is_made_again(tmp_path: Path) -> None:
+    archive = Folder(tmp_path)
+    archive.put(DIGEST, b"body")
+    shutil.rmtree(tmp_path / DIGEST.hex()[:2])
+    archive.put(DIGEST, b"body")
+    assert archive.get(DIGEST, 4) == b"body"
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

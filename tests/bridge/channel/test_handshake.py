@@ -373,6 +373,17 @@ def test_many_robots_behind_one_address_are_not_slowed_down():
     assert server.statistics()["connections"] == 8
 
 
+def test_a_robot_that_finds_the_server_full_is_not_slowed_down_for_it():
+    server = make_server(1000.0, ServerConfig(source_rate=0.001, source_burst=2.0, max_connections=1))
+    Steps(server=server, client=make_client(1000.0, None, robot("robot_1"))).until_connected()
+    for _ in range(5):
+        [refusal] = Steps(server=server, client=make_client(1000.0, None, robot("robot_2"))).until_offer()
+        assert refusal[0] == Kind.REFUSAL and refusal[-1] == Reason.FULL
+    server.close()
+    server.datagrams_to_send(1000.0)
+    Steps(server=server, client=make_client(1000.0, None, robot("robot_2"))).until_connected()
+
+
 def busy_server(seconds: float, config: ServerConfig) -> tuple[Server, Callable[[], int]]:
     """A server on a machine where each handshake takes so long, and how many PROOFs it has examined."""
     reading = [0]

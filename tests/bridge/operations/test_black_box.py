@@ -107,6 +107,28 @@ def test_a_bag_gives_the_records_around_each_event_at_any_pace(robot: RobotHome,
     assert running.box.triggers["crash"].fired == 2
 
 
+def test_an_event_after_the_end_of_a_bag_is_written_while_the_robot_waits_for_its_server(robot: RobotHome, bag: Path):
+    running = opened(robot, f'{TOPICS}{CRASH}\n[source]\nkind = "bag"\npath = "{bag}"\nspeed = "max"\n')
+    streams: set[bytes] = set()
+
+    def on_turn() -> None:
+        if running._unspooled or running.chunks == 0 or not running._source_ended.is_set() or running._ring:
+            return
+        chunks = running.spool.following(running.writer.stream, None, 1 << 30)
+        if chunks and chunks[-1].header.goodbye:
+            streams.add(chunks[-1].header.stream)
+            if len(streams) == 2:
+                running.stop()
+            else:
+                running.fire("by hand")
+
+    running.run(on_turn=on_turn)
+    found = seen(robot)
+    assert [each["why"] for each in found["trigger"]] == ["/bumper data == true"] * 2 + ["by hand"]
+    assert found["/scan"] == [*range(250, 336), *range(470, 600)], "all that was kept for the last one, too"
+    assert running.summary.startswith(f"{60 + 120 + 86 + 130} records captured") and len(streams) == 2
+
+
 def test_what_there_is_no_memory_for_is_lost_in_the_log_and_in_the_figures(robot: RobotHome, bag: Path):
     text = f'{TOPICS}{CRASH}before = "1h"\n'.replace('before = "5s"\n', "") + 'memory = "64 KiB"\n'
     running = opened(robot, f'{text}[source]\nkind = "bag"\npath = "{bag}"\nspeed = "max"\n')
