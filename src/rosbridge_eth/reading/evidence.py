@@ -34,7 +34,7 @@ from rosbridge_eth.errors import ChainError, ConfigError, StoreError, Verificati
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import proofs as chain
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.reading.verdict import Governing, grouped, printable, shown
+from rosbridge_eth.reading.verdict import Governing, counted, grouped, printable, shown
 from rosbridge_eth.reading.verify import LAST_MOMENT, ProvenRecord, Verifier
 from smcrypto import sm3, x509
 
@@ -185,11 +185,11 @@ class Statement(NamedTuple):
         }  # fmt: skip
 
     def proves(self) -> Iterator[str]:
-        sealed, count = [one.header.sealed_ms * 10**6 for one in self.records], len(self.records)
+        sealed = [one.header.sealed_ms * 10**6 for one in self.records]
         low, high = time_text(min(sealed)), time_text(max(sealed))
         last, standing = self.blocks[-1], self.standing
         yield (
-            f"The robot {self.robot} signed {count:,} record{'' if count == 1 else 's'} as given here, sealed"
+            f"The robot {self.robot} signed {counted(len(self.records), 'record')} as given here, sealed"
             f" {f'at {low}' if low == high else f'between {low} and {high}'} by its own clock. The robot is whoever has"
             " the key for which the CA made its certificate."
         )
@@ -198,8 +198,8 @@ class Statement(NamedTuple):
             f" {_blocks(sorted({one.block for one in self.records}))}, if these blocks are the chain's."
         )
         yield (
-            f"In block {last.number} ({_time(last)}) the contract counts {standing.chunks:,} chunks of this robot,"
-            f" which is {'REVOKED' if standing.revoked else 'not revoked'} there."
+            f"In block {last.number} ({_time(last)}) the contract counts {counted(standing.chunks, 'chunk')} of this"
+            f" robot, which is {'REVOKED' if standing.revoked else 'not revoked'} there."
         )
 
     def proves_not(self, node: str = "") -> Iterator[str]:

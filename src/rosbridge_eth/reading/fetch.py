@@ -13,7 +13,7 @@ from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
 from rosbridge_eth.reading.cache import Cache, add_topics, open_cache
 from rosbridge_eth.reading.verdict import Bookmarks, Links, Progress, Verdict, shown
-from rosbridge_eth.reading.verify import EVERYTHING, HEARTBEAT, Bodies, Choice, ProvenChunk, ProvenRecord, Verifier
+from rosbridge_eth.reading.verify import EVERYTHING, Bodies, Choice, ProvenChunk, ProvenRecord, Verifier
 from smcrypto import sm2
 
 if TYPE_CHECKING:
@@ -70,8 +70,7 @@ class Reading:
 def read_robot(
     ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
     bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
-    heartbeat: float = HEARTBEAT, bodies: Bodies | None = None, before: Reading | None = None,
-    granted: Mapping[bytes, bytes] | None = None,
+    bodies: Bodies | None = None, before: Reading | None = None, granted: Mapping[bytes, bytes] | None = None,
 ) -> Reading:  # fmt: skip
     """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
 
@@ -104,9 +103,8 @@ def read_robot(
             at, links, next_block = kept.progress, kept.links, kept.next_block
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, heartbeat=heartbeat,
-        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), bodies=bodies,
-        granted=granted,
+        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, bodies=bodies, granted=granted,
+        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log),
     )  # fmt: skip
     first_block = max(registrations[0].block if registrations else 0, next_block)
     events = ledger.data_events(tk, first_block, standing.data_block)

@@ -31,6 +31,10 @@ MAX_FINDINGS: Final = 500
 MAX_SHOWN: Final = 120
 
 
+def counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
 class Kind(Enum):
     """A finding's name for programs, whether it is a violation, what its count counts, and what it says."""
 
@@ -65,7 +69,7 @@ class Kind(Enum):
         return kind
 
     def counted(self, count: int) -> str:
-        return f"{count:,} {self.unit}{'' if count == 1 else 's'}"
+        return counted(count, self.unit)
 
 
 @dataclass(slots=True)
@@ -254,8 +258,8 @@ class Verdict:
     """How a reading ended. What is counted is counted since the first chunk, over all readings that the bookmark links.
 
     chunks: how many the contract counts. block: up to which the chain was looked at. records: opened and proven.
-    head: the newest chunk that is the robot's; None where there is none. silent: it is older than the heartbeat, and
-    the robot has not said goodbye. nodes: what other nodes said otherwise.
+    head: the newest chunk that is the robot's; None where there is none. silent: it is older than the
+    heartbeat, in seconds, and the robot has not said goodbye. nodes: what other nodes said otherwise.
     """
 
     robot: str
@@ -274,7 +278,7 @@ class Verdict:
     def lines(self) -> Iterator[str]:
         """For a person. Nothing in them can act on a terminal."""
         sound = "sound" if self.sound else "NOT SOUND"
-        yield f"{self.robot}: {sound}, {self.chunks:,} chunks, read up to block {self.block}"
+        yield f"{self.robot}: {sound}, {counted(self.chunks, 'chunk')}, read up to block {self.block}"
         head = self.head
         if head is None:
             yield "  no chunk of this robot is written"
@@ -286,13 +290,13 @@ class Verdict:
             if head.goodbye:
                 yield "  the robot has said goodbye: up to there, nothing is missing at the end"
             elif self.silent:
-                ago = f"longer ago than its heartbeat of {duration_text(self.heartbeat)}"
-                yield f"  that is {ago}: it is silent, or what it wrote since is withheld"
+                ago = f"longer ago than {duration_text(self.heartbeat)}, a robot's heartbeat if it was set no other"
+                yield f"  that is {ago}: it is silent, or what it wrote since is withheld or not written yet"
             else:
                 yield "  the robot has not said goodbye: more may follow"
         told = [kind for kind in Kind if kind.label in self.counts]
         counts = "".join(f"; {kind.label}: {kind.counted(self.counts[kind.label])}" for kind in told)
-        yield f"  {self.records:,} record{'' if self.records == 1 else 's'} proven{counts}"
+        yield f"  {counted(self.records, 'record')} proven{counts}"
         yield from (f"  certificate {certificate}" for certificate in self.certificates)
         yield from (f"  {finding}" for finding in self.findings)
         if sum(one.count for one in self.findings) < sum(self.counts.values()):

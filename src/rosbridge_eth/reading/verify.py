@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
 
 HEARTBEAT: Final = 3600.0
+"""Seconds without a message after which a robot seals an empty chunk, unless its robot.toml says otherwise."""
 CLOCK_AHEAD_MS: Final = 300_000
 """A chunk that was sealed so much later than its block, by the clocks of robot and chain, is told."""
 CLOCK_BACK_MS: Final = 1_000
@@ -129,7 +130,7 @@ class Verifier:
     without it archived records are told and not opened. granted: by a chunk's digest, the content key that another
     reader handed over.
     at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
-    now, heartbeat: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
+    now: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
     may have chunks of this robot.
     """
 
@@ -137,14 +138,13 @@ class Verifier:
         self, name: str, ledger: bytes, standing: Standing, registrations: Sequence[RegistrationEvent], *,
         trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
         mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
-        heartbeat: float = HEARTBEAT, elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None,
-        granted: Mapping[bytes, bytes] | None = None,
+        elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None, granted: Mapping[bytes, bytes] | None = None,
     ) -> None:  # fmt: skip
         self.name, self.log = name, Log(ledger, robot_id(name))
         self._bodies, self._granted = bodies, granted or {}
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
-        self._now, self._heartbeat, self._elsewhere = now, heartbeat, elsewhere[:MAX_ELSEWHERE]
+        self._now, self._elsewhere = now, elsewhere[:MAX_ELSEWHERE]
         self._at, self.links = deepcopy(at or Progress()), links or Links()
         self.findings = Findings(self._at.found, self._at.findings)
         # What a reading goes on behind was honest, so what was withheld there was so by an archive.
@@ -405,10 +405,10 @@ class Verifier:
 
     def verdict(self, nodes: Sequence[str] = ()) -> Verdict:
         head = self._at.head
-        silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > self._heartbeat
+        silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > HEARTBEAT
         return Verdict(
             self.name, self.findings.sound, self._standing.chunks, self._block, head, self._at.records,
-            dict(self.findings.counts), tuple(self._signers), silent, self._heartbeat, tuple(self.findings.kept),
+            dict(self.findings.counts), tuple(self._signers), silent, HEARTBEAT, tuple(self.findings.kept),
             tuple(nodes),
         )  # fmt: skip
 

@@ -656,7 +656,8 @@ def test_messages_captured_while_the_clock_was_not_synchronised_are_counted():
 def test_silence_longer_than_the_heartbeat_is_told(hours, goodbye, silent):
     verdict = read(Pen().chunks(2, goodbye=goodbye), now=T0 + hours * 3600).verdict
     assert verdict.silent == silent
-    assert ("longer ago than its heartbeat" in "\n".join(verdict.lines())) == silent
+    assert next(read(Pen().chunks(1)).verdict.lines()) == "robot_1: sound, 1 chunk, read up to block 1000"
+    assert ("longer ago than 1h, a robot's heartbeat" in "\n".join(verdict.lines())) == silent
     assert verdict.sound
 
 
