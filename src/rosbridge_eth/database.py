@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -169,8 +169,9 @@ class Database:
     def _reserved(self) -> bool:
         """Whether the reserve is there, or could be made."""
         size = 2 * self._wal_pages * _PAGE
-        if self._reserve.exists() and self._reserve.stat().st_size == size:  # a crash may have cut it short
-            return True
+        with suppress(FileNotFoundError):
+            if self._reserve.stat().st_size == size:  # a crash may have cut it short
+                return True
         room = os.statvfs(self.path.parent)
         if room.f_bavail * room.f_frsize < size:
             return False
