@@ -228,6 +228,34 @@ def test_a_node_stands_for_what_it_publishes(ros: Graph):
     assert counts == {"/joints": 1, "/shared": 2, "/joints/late": 1}
 
 
+RELOADED = """
+import logging, queue, threading
+from rosbridge_eth.sources import Selection
+from rosbridge_eth.sources.ros2 import source as ros2
+
+told = queue.SimpleQueue()
+handler = logging.Handler(logging.WARNING)
+handler.emit = lambda record: told.put(record.getMessage())
+logging.getLogger().addHandler(handler)
+ros2.UNMATCHED_AFTER = 0.1
+stop, source = threading.Event(), ros2.Ros2Source(Selection(["/first"]))
+running = threading.Thread(target=source.run, args=(print, stop), daemon=True)
+running.start()
+print(told.get(timeout=20))
+source.watch(Selection(["/second"]))
+print(told.get(timeout=20))
+stop.set()
+running.join()
+"""
+
+
+def test_a_name_that_nobody_publishes_is_said_after_every_change_of_the_topics(ros: Graph):
+    """As `robot` changes them at a reload."""
+    first, second = ros.run(RELOADED).splitlines()
+    assert first.startswith("nothing publishes /first yet; domain")
+    assert second.startswith("nothing publishes /second yet; domain")
+
+
 def test_ten_topics_at_100_hz_lose_nothing(ros: Graph):
     topics = [f"/odom_{number}" for number in range(10)]
     node = ros.node("/base")
