@@ -463,9 +463,10 @@ class Submitter:
                 break
             nonce, gas = latest + len(raws), contract.call_gas(data)
             raws.append(self._ledger.sign(self._operator, data, nonce=nonce, gas=gas, fees=funds.fees, value=wei).raw)
-        self.counts["top-ups"] += len(raws)
         for error in self._ledger.send(raws):
-            if error is not None and not isinstance(error, AlreadyKnown):
+            if error is None:
+                self.counts["top-ups"] += 1
+            elif not isinstance(error, AlreadyKnown):
                 self.funds = str(error)
 
 

@@ -14,6 +14,7 @@ from bridge.ledger.world import KEYS, Pen, World
 from rosbridge_eth.inbox import Head, InboxExchanged, Outcome
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.submitter import ALL, BATCH_BYTES, IN_FLIGHT, PATIENCE, Submitter
+from rosbridge_eth.ledger.transport import Underpriced
 
 ROBOT, OPERATOR = KEYS.robot(1).address, KEYS.operator.address
 
@@ -528,6 +529,19 @@ def test_an_empty_treasury_is_said_and_nothing_is_dropped(tmp_path: Path):
     world.model.state.balances[OPERATOR] = ETH
     world.run()
     assert world.submitter.funds is None
+
+
+def test_a_top_up_that_the_node_refuses_is_said_and_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    world = World(tmp_path, wei=0)
+    world.take(world.pen.chunks(1))
+    with monkeypatch.context() as patched:
+        patched.setattr(world.model, "_accept", lambda tx: Underpriced("transaction underpriced"))
+        for _ in range(3):
+            world.turn()
+    assert "underpriced" in str(world.submitter.funds)
+    assert world.submitter.counts["top-ups"] == 0
+    world.run()
+    assert world.submitter.counts["top-ups"] == 1 and world.submitter.funds is None
 
 
 def test_robots_without_money_take_no_room_from_one_that_has_some(tmp_path: Path):
