@@ -218,6 +218,13 @@ def test_the_servers_own_port_is_told_from_a_strangers(place: Place, server: Add
     assert of(findings, "UDP port")["result"] == "ok" and "a server answers" in of(findings, "UDP port")["found"]
 
 
+def test_an_address_that_no_interface_here_has_is_not_said_to_be_in_use(place: Place, capsys: Capture):
+    place.configure("127.0.0.1:0", "192.0.2.9:7410")
+    _, findings = doctor(capsys)
+    assert of(findings, "UDP port")["result"] == "broken"
+    assert "no interface here has that address" in of(findings, "UDP port")["mend"]
+
+
 @pytest.mark.parametrize("talkative", [False, True])
 def test_a_stranger_on_the_udp_port_is_broken_even_one_that_answers(place: Place, talkative: bool, capsys: Capture):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
