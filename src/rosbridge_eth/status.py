@@ -193,7 +193,6 @@ def _operator(place: OperatorHome) -> Report:
             Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
         ) as ledger:
             _head(report, ledger)
-            report["operator"]["eth"] = ledger.balance(place.account) / _WEI
             _add_standings(report, ledger, robots)
     report["alarms"] = [*_alarms(report)]
     return report
@@ -227,21 +226,27 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
 
 
 def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment]) -> None:
-    """What the chain has of each robot, and how long its account and the operator's last at what was spent lately."""
-    head, seconds, total = report["node"]["block"], 0, 0
+    """What the chain has of each robot, and how long its account and the operator's last at what was spent lately.
+
+    The operator's has to last for what it and the robots have less all together: so a top-up counts for nothing.
+    """
+    head, seconds, total, operator = report["node"]["block"], 0, 0, report["operator"]
     before: dict[bytes, Standing] = {}
+    treasury = ledger.balance(operator["account"])
+    operator["eth"] = treasury / _WEI
     with _asking(report, "what robots spend"):
         block = max(1, head - SPENDING_BLOCKS)
         before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
+        total = ledger.balance(operator["account"], block) - treasury
         seconds = ledger.block_time(head) - ledger.block_time(block)
     for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
-        spent = max(0, before[tk].balance - now.balance) if tk in before else 0
+        spent = before[tk].balance - now.balance if tk in before else 0
         total += spent
         report["robots"][robot.name] |= {
             "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,
             "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
         }  # fmt: skip
-    report["operator"]["days_left"] = _days(report["operator"]["eth"] * _WEI, total, seconds)
+    operator["days_left"] = _days(treasury, total, seconds)
 
 
 def _days(balance: float, spent: int, seconds: int) -> float | None:

@@ -113,7 +113,7 @@ def test_with_the_node_it_shows_what_the_chain_has(
 
 
 def test_how_long_an_account_lasts_is_what_it_spent_of_late(
-    place: Place, on_chain: None, write: Callable[..., None], capsys: Capture, monkeypatch: Patch
+    place: Place, keys: Keyring, on_chain: None, write: Callable[..., None], capsys: Capture, monkeypatch: Patch
 ):
     tester, chunks = place.chain.ethereum_tester, [*chunk_chain(4)]
     write(chunks[0])
@@ -124,6 +124,13 @@ def test_how_long_an_account_lasts_is_what_it_spent_of_late(
     now = place.ledger.standings([TK])[0].balance
     days = status(capsys)["robots"]["robot_1"]["days_left"]
     assert days == pytest.approx(now / (then - now), rel=0.001)
+    treasury = status(capsys)["operator"]["days_left"]
+    assert treasury == pytest.approx(place.ledger.balance(place.operator.account) / (then - now), rel=0.001)
+    place.ledger.alloc_eth(keys.operator, place.ledger.standings([TK])[0].account, 10**17)
+    monkeypatch.setattr(module, "SPENDING_BLOCKS", place.ledger.block_number() - block)
+    report = status(capsys)
+    assert report["robots"]["robot_1"]["days_left"] is None, "it has more than before"
+    assert 0 < report["operator"]["days_left"] < treasury, "a top-up hides nothing of what is spent"
     write(chunks[2])
     monkeypatch.setattr(module, "SPENDING_BLOCKS", 0)
     assert status(capsys)["robots"]["robot_1"]["days_left"] is None, "nothing was spent: nothing is known"
