@@ -54,7 +54,7 @@ def kept(chunks: int, folder: Path) -> None:
     reader, trust, log = sm2.PrivateKey.generate(), Trust([]), Log(LEDGER, robot_id(NAME))
     parts = re.split(rb"(?<=\d\.\d)(\d+)", sample_lines()[1][0])
     number = random.Random(1)
-    cache = open_cache(folder, NAME, log, reader, trust)
+    cache = open_cache(folder, NAME, log, reader, trust, {})
     took = -time.process_time()
     for index in range(chunks):
         place = Place(index, b"s" * 16, index, number.randbytes(32), index + 1, T0_MS // 1000 + index, b"t" * 32)
@@ -79,7 +79,7 @@ def kept(chunks: int, folder: Path) -> None:
         ("all of the topic", Choice("/robot_1/odom")),
     ):
         took = -time.process_time()
-        cache = open_cache(folder, NAME, log, reader, trust)
+        cache = open_cache(folder, NAME, log, reader, trust, {})
         found = sum(1 for _ in cache.records(choice, set()))
         cache.close()
         took += time.process_time()
