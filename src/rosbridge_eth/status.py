@@ -193,7 +193,7 @@ def _operator(place: OperatorHome) -> Report:
             Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
         ) as ledger:
             _head(report, ledger)
-            _add_standings(report, ledger, robots)
+            _add_standings(report, ledger, robots, round(config.funds.by * _WEI))
     report["alarms"] = [*_alarms(report)]
     return report
 
@@ -225,10 +225,10 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
                       for (tk, why), count in reasons.items()]  # fmt: skip
 
 
-def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment]) -> None:
-    """What the chain has of each robot, and how long its account and the operator's last at what was spent lately.
+def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment], top_up: int) -> None:
+    """What the chain has of each robot, and how long its account and the operator's last at what robots spent lately.
 
-    The operator's has to last for what it and the robots have less all together: so a top-up counts for nothing.
+    top_up: wei that an account is given at once. One that has more than before was given that.
     """
     head, seconds, total, operator = report["node"]["block"], 0, 0, report["operator"]
     before: dict[bytes, Standing] = {}
@@ -237,10 +237,11 @@ def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolm
     with _asking(report, "what robots spend"):
         block = max(1, head - SPENDING_BLOCKS)
         before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
-        total = ledger.balance(operator["account"], block) - treasury
         seconds = ledger.block_time(head) - ledger.block_time(block)
     for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
-        spent = before[tk].balance - now.balance if tk in before else 0
+        known = before.get(tk)
+        less = known.balance - now.balance if known is not None and known.account == now.account else 0
+        spent = less if less >= 0 else less % top_up
         total += spent
         report["robots"][robot.name] |= {
             "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,

@@ -254,10 +254,9 @@ class Ledger:
         """UTC seconds."""
         return self.block(number).time
 
-    def balance(self, account: str, block: int | str = "latest") -> int:
+    def balance(self, account: str) -> int:
         with self._node.asking():
-            found = self._w3.eth.get_balance(self._w3.to_checksum_address(account), block)  # type: ignore[arg-type]
-            return natural(found, 2**256)
+            return natural(self._w3.eth.get_balance(self._w3.to_checksum_address(account)), 2**256)
 
     def ask(self, requests: Sequence[tuple[str, list[Any]]], form: Callable[[list[Any]], _Answer]) -> _Answer:
         """What `form` makes of the node's answers to these calls of JSON-RPC; ChainError where it refuses one."""
