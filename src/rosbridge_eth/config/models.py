@@ -171,7 +171,7 @@ class TopicConfig(Section):
 
     topic: Pattern
     fields: list[FieldPath] = []
-    rate: Annotated[float, Field(gt=0, le=10_000)] | None = None
+    rate: Annotated[float, Field(ge=1e-6, le=10_000)] | None = None
     at: TimeNs | None = None
     once: bool = False
     from_: TimeNs | None = Field(default=None, alias="from")
@@ -325,7 +325,7 @@ class SimConfig(Section):
     kind: Literal["sim"]
     robot: TopicPart = "robot_1"
     seed: int = Field(default=1, ge=0, lt=2**63)
-    rate: float = Field(default=10.0, gt=0, le=10_000)
+    rate: float = Field(default=10.0, ge=1e-6, le=10_000)
     duration: DurationNs | None = None
     speed: Speed = 1.0
 

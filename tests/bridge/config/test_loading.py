@@ -126,7 +126,7 @@ MISTAKES = {
     'topics = ["/a b"]': "line 1: topics[0].topic: '/a b' is not a name or pattern",
     'nodes = ["/["]': "line 1: nodes[0]: '/[' is not a name or pattern",
     "topics = [{rate = 1}]": "topics[0].topic is missing",
-    'topics = [{topic = "/a", rate = 0}]': "line 1: topics[0].rate is 0; it should be more than 0",
+    'topics = [{topic = "/a", rate = 0}]': "line 1: topics[0].rate is 0; it should be at least 1e-06",
     'topics = [{topic = "/a", rate = "2"}]': "topics[0].rate is '2'; it should be a number",
     'topics = [{topic = "/a", rate = inf}]': "topics[0].rate is inf; it should be a finite number",
     'topics = [{topic = "/a", once = 1}]': "topics[0].once is 1; it should be true or false",
