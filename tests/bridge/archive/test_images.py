@@ -141,8 +141,8 @@ def well(site: faults.Site) -> int:
 
 def test_doctor_tries_the_archive_at_both_ends(site: faults.Site, s3: S3) -> None:
     def tried() -> list[doctor.Finding]:
-        found = [*doctor.examine({"archive": doctor.archive}, site.home.path, None)]
-        return [*found, *doctor.examine({"archive": doctor.readers_archive}, site.reader.path, None)]
+        found = [*doctor.examine({"archive": doctor.archive}, site.home, None)]
+        return [*found, *doctor.examine({"archive": doctor.readers_archive}, site.reader, None)]
 
     faults.until("the archive is well", lambda: well(site) == 2)
     assert [(each.result, each.found) for each in tried()] == [
