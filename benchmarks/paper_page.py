@@ -344,6 +344,7 @@ instead of written whole:
 
 {table(head, limits)}
 
-Held to runs of this machine, processor time in seconds:
+Held to runs of this machine, processor time in seconds. What a session costs that says nothing (looks for what the
+operator and the submitter changed, and its figures, once a second) is not in the model:
 
 {table(["", "workers", "model", "submitter", "model", "proven and equal", "lost / doubled"], rows)}"""
