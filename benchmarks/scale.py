@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -100,8 +100,8 @@ def holds(costs: Costs, rate: float, gas_a_second: float, block: float, of: Call
     return int(gas_a_second / of(need(costs, 1, rate, block)))
 
 
-def calibrate(quick: bool) -> tuple[Costs, dict[str, Any]]:
-    """What a record costs and chunks weigh; the other costs, which a run of `load.py` gives, are 0."""
+def calibrate(quick: bool) -> tuple[dict[str, float], list[tuple[float, float, float]]]:
+    """The costs of `Costs` that a run of `load.py` does not give, and the rows that they were fitted to."""
     who, rows = bridge_costs.Identities(), []
     for per_chunk in (1, 10, 100):
         records = (5 if quick else 100) * per_chunk
@@ -112,12 +112,12 @@ def calibrate(quick: bool) -> tuple[Costs, dict[str, Any]]:
     inverse, server, sizes = (numpy.array(column) for column in zip(*rows, strict=True))
     _, record_ms = numpy.polyfit(inverse, server, 1)
     chunk_bytes, record_bytes = numpy.polyfit(inverse, sizes, 1)
-    return Costs(max(0.0, record_ms), 0.0, 0.0, 0.0, record_bytes, chunk_bytes, 0.0), {"rows": rows}
+    return {"record_ms": max(0.0, record_ms), "record_bytes": record_bytes, "chunk_bytes": chunk_bytes}, rows
 
 
 def measure(quick: bool) -> dict[str, Any]:
     """Calibrate, run more robots than it was calibrated by, and compare."""
-    costs, part = calibrate(quick)
+    fitted, rows = calibrate(quick)
     counts, messages, per_chunk = ([3, 6], 10, 5) if quick else ([500, 1000, 2000], 40, 10)
     runs = []
     with tempfile.TemporaryDirectory() as folder:
@@ -129,8 +129,8 @@ def measure(quick: bool) -> dict[str, Any]:
             operator.close()
     first = runs[0]
     # A worker's time for a chunk is that with many robots: it keeps tables for the keys of 150 or so.
-    costs = replace(
-        costs, chunk_ms=(first.message_cpu_ms - costs.record_ms) * first.sent / first.chunks,
+    costs = Costs(
+        **fitted, chunk_ms=(first.message_cpu_ms - fitted["record_ms"]) * first.sent / first.chunks,
         handshake_ms=first.handshake_cpu_ms, submitted_ms=first.submitter_cpu_ms * first.sent / first.chunks,
         session_kib=first.growth_kib_per_session,
     )  # fmt: skip
@@ -153,4 +153,4 @@ def measure(quick: bool) -> dict[str, Any]:
         } for rate in RATES}
         for (name, gas), block in zip(CHAINS.items(), (1.0, 20.0, 12.0, 2.0), strict=True)
     }  # fmt: skip
-    return part | {"costs": asdict(costs), "compared": compared, "needs": needs, "limits": limits}
+    return {"rows": rows, "costs": asdict(costs), "compared": compared, "needs": needs, "limits": limits}

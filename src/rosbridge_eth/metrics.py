@@ -30,7 +30,7 @@ from prometheus_client.multiprocess import MultiProcessCollector
 
 from rosbridge_eth.channel import Drop
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.inbox import Inbox, Waiting
+from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class _Shared(MultiProcessCollector):
         for _ in range(20):
             with suppress(struct.error, FileNotFoundError):
                 return super().collect()  # type: ignore[no-untyped-call]
-            time.sleep(0.05)
+            time.sleep(0.05)  # its process is about to write it
         raise ValueError("the figures of a process are cut off")
 
 
@@ -307,9 +307,9 @@ def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     process = "submitter"
     beat(process, wall)
-    waiting, states = inbox.totals(), inbox.states([*names])
+    states = inbox.states([*names])
     for tk, name in names.items():
-        held = waiting.get(tk, Waiting(0, 0, 0, None))
+        held = inbox.waiting(tk, states[tk].position)
         WAITING.labels(name).set(held.chunks)
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))

@@ -138,8 +138,8 @@ class Reception:
                 if before is not None and now - before.heard <= ALIVE:
                     log.warning(
                         "%s: a session took the place of one that was alive: the robot was killed and started again,"
-                        " or heard nothing from a server that is too busy, or two machines have its identity; then"
-                        " revoke it and register it anew", peer,
+                        " or heard nothing from a server that is too busy, or two machines have its identity, in"
+                        " which case revoke it and register it anew", peer,
                     )  # fmt: skip
                 log.info("%s: session begun", peer)
                 self._look_at = now  # its handshake may have been allowed before the list changed
@@ -316,7 +316,9 @@ class Reception:
 
         wall: seconds since 1970, for the inbox.
         """
-        if self._commit_at is not None and (now >= self._commit_at or self._gathered() >= ENOUGH):
+        if self._commit_at is not None and (
+            now >= self._commit_at or sum(len(session.offers) for session in self.sessions.values()) >= ENOUGH
+        ):
             self._commit_at = None
             self.commit(now, wall)
         if now >= self._look_at:
@@ -324,9 +326,6 @@ class Reception:
             self._append([], now, wall)
             self._look_at_archive(now)
             self.look(now)
-
-    def _gathered(self) -> int:
-        return sum(len(session.offers) for session in self.sessions.values())
 
     def commit(self, now: float, wall: float) -> None:
         """Everything gathered goes into the inbox by one commit; then each robot is answered."""

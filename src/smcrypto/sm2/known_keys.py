@@ -22,7 +22,7 @@ from smcrypto.sm2.points import Comb
 __all__ = ["KnownKeys", "known_keys"]
 
 _Key: TypeAlias = tuple[Curve, Point]
-_TAKES_A_PLACE: Final = 16  # uses after which a key may have the comb of another one go
+_TAKES_A_PLACE: Final = 16  # uses from which on a key's comb may take the place of another key's
 
 
 class _Record:
@@ -86,7 +86,7 @@ class KnownKeys:
         return comb
 
     def _may_build(self, record: _Record, points: int) -> bool:
-        """Whether there is room, or (for a first comb) some key that has one was not met since this one was."""
+        """Whether there is room, or (for a first comb) this key was used often, and some key with a comb not since."""
         if not self._known or self._points + points <= self._limits[0]:
             return True
         oldest = next(iter(self._known.values()))
