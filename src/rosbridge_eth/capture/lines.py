@@ -147,11 +147,12 @@ def parse_line(line: bytes, most: int = MAX_LINE) -> Line:
     if form is None or (form is StreamLine) != is_stream:
         kinds_of_lines = "a message, a type, a loss, an event or a stream"
         raise VerificationError(f"a record has not the members of {kinds_of_lines}, in order")
-    for (name, found), kind in zip(members.items(), kinds, strict=True):
-        # A time of more than 64 bits was read as a double.
-        if type(found) is not kind or (isinstance(found, int) and not 0 <= found < 1 << 63):
-            raise VerificationError(f"{name!r} of a record is not {_KINDS[kind]}")
-    line_found: Line = form._make(members.values())
+    values = tuple(members.values())
+    # A time of more than 64 bits was read as a double.
+    if tuple(map(type, values)) != kinds or not all(0 <= value < 1 << 63 for value in values if type(value) is int):
+        wanted = ", ".join(map(_KINDS.__getitem__, kinds))
+        raise VerificationError(f"{', '.join(members)} of a record are not {wanted}")
+    line_found: Line = form._make(values)
     return line_found
 
 
