@@ -100,7 +100,7 @@ def test_odometry_choosing_and_writing_alone(benchmark: Any) -> None:
     inputs = messages("/robot_1/odom")
     capture = captured(TopicRule("**"))
     decoded = {message.raw: message.decoder.decode(message.raw) for message in inputs}
-    lines = {message.raw: parse_line(capture(message)) for message in inputs}
+    lines: dict[bytes, Any] = {message.raw: parse_line(capture(message)) for message in inputs}
     conversion = Conversion(inputs[0].decoder)
 
     def write(message: RawMessage) -> bytes:
@@ -128,10 +128,11 @@ def test_odometry_parsed_by_json(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="read Odometry")
 def test_odometry_restored(benchmark: Any) -> None:
     capture, inputs = captured(TopicRule("**")), messages("/robot_1/odom")
-    data = {message.raw: parse_line(capture(message)).data for message in inputs}
-    restoration = Restoration(parse_line(definition_line(inputs[0].decoder)).decoder())
+    lines: dict[bytes, Any] = {message.raw: parse_line(capture(message)) for message in inputs}
+    definition: Any = parse_line(definition_line(inputs[0].decoder))
+    restoration = Restoration(definition.decoder())
     run(benchmark, "rosbridge_eth, to ROS bytes", lambda m: restoration.decoder.encode(
-        restoration.restore(data[m.raw]).message), inputs)  # fmt: skip
+        restoration.restore(lines[m.raw].data).message), inputs)  # fmt: skip
 
 
 @pytest.mark.benchmark(group="capture Imu")

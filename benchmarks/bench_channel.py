@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 from rosbridge_eth import identity as ids
@@ -169,7 +170,7 @@ def ciphers() -> None:
     sizes = (100, 600, SEGMENT_SIZE)
     print("\ncipher of one packet, µs        100 B   600 B  1166 B")
     print("  SM4-GCM, smcrypto          " + "".join(
-        f"{each(lambda s=s: gcm.encrypt(nonce, bytes(s), header), 300):8.1f}" for s in sizes))
+        f"{each(partial(gcm.encrypt, nonce, bytes(size), header), 300):8.1f}" for size in sizes))
     try:
         from cryptography.hazmat.primitives.ciphers.aead import AESGCM
     except ImportError:
@@ -177,7 +178,7 @@ def ciphers() -> None:
         return
     aes = AESGCM(key)
     print("  AES-GCM, OpenSSL           " + "".join(
-        f"{each(lambda s=s: aes.encrypt(nonce, bytes(s), header), 300):8.1f}" for s in sizes))
+        f"{each(partial(aes.encrypt, nonce, bytes(size), header), 300):8.1f}" for size in sizes))
 
 
 def strangers() -> None:

@@ -21,14 +21,15 @@ import tracemalloc
 from datetime import UTC, datetime
 from itertools import cycle, islice
 from pathlib import Path
+from typing import Any
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from rosbridge_eth.capture import Capture, MessageLine, TopicRule, definition_line, parse_line, stream_line
 from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.reading.cache import open_cache
+from rosbridge_eth.reading.cache import Cache, open_cache
 from rosbridge_eth.reading.verdict import Progress
 from rosbridge_eth.reading.verify import Choice, Place, ProvenChunk, ProvenRecord, Verifier, is_signed
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
@@ -54,7 +55,15 @@ def kept(chunks: int, folder: Path) -> None:
     reader, trust, log = sm2.PrivateKey.generate(), Trust([]), Log(LEDGER, robot_id(NAME))
     parts = re.split(rb"(?<=\d\.\d)(\d+)", sample_lines()[1][0])
     number = random.Random(1)
-    cache = open_cache(folder, NAME, log, reader, trust, {})
+
+    def opened() -> Cache:
+        cache = open_cache(folder, NAME, log, reader, trust, {})
+        if cache is None:
+            raise SystemExit(f"nothing can be kept in {folder}")
+        return cache
+
+    chunk: Any = None  # of which nothing is kept
+    cache = opened()
     took = -time.process_time()
     for index in range(chunks):
         place = Place(index, b"s" * 16, index, number.randbytes(32), index + 1, T0_MS // 1000 + index, b"t" * 32)
@@ -63,7 +72,7 @@ def kept(chunks: int, folder: Path) -> None:
             parts[1::2] = [b"%03d" % number.randrange(1000) + part[3:] for part in parts[1::2]]
             message = MessageLine("/robot_1/odom", TYPE, "ros1", (T0_MS + 1000 * index + 100 * n) * 10**6, 0, True, {})
             records.append(ProvenRecord(place, n, b"".join(parts), message, None))
-        cache.add(ProvenChunk(place, None, b"", (), tuple(records)))
+        cache.add(ProvenChunk(place, chunk, b"", (), tuple(records)))
         cache.links.add(place.digest, index)
         if cache.full or index == chunks - 1:
             cache.commit(Progress(index + 1, records=10 * index + 10), index + 2, index + 1, b"")
@@ -79,7 +88,7 @@ def kept(chunks: int, folder: Path) -> None:
         ("all of the topic", Choice("/robot_1/odom")),
     ):
         took = -time.process_time()
-        cache = open_cache(folder, NAME, log, reader, trust, {})
+        cache = opened()
         found = sum(1 for _ in cache.records(choice, set()))
         cache.close()
         took += time.process_time()

@@ -198,6 +198,6 @@ def run_gmalg_exchange(benchmark: Any) -> None:
 
     def once() -> bytes:
         _, t = own.begin_key_exchange()
-        return own.end_key_exchange(16, t, peer_ephemeral, b"B", peer, gmalg.KEYXCHG_MODE.INITIATOR)
+        return bytes(own.end_key_exchange(16, t, peer_ephemeral, b"B", peer, gmalg.KEYXCHG_MODE.INITIATOR))
 
     run(benchmark, "gmalg", once)

@@ -54,7 +54,7 @@ def openssl(make_mode: Callable[[Any], Any], data: bytes, *, decrypting: bool = 
     def call() -> bytes:
         cipher = ciphers.Cipher(algorithm(KEY), mode)
         stream = cipher.decryptor() if decrypting else cipher.encryptor()
-        return stream.update(data) + stream.finalize()
+        return bytes(stream.update(data) + stream.finalize())
 
     return call
 

@@ -29,8 +29,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 import geth_network
 from ports import free_port
@@ -38,6 +39,9 @@ from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import NOTHING, Receipt, call_gas, set_data_gas
 from rosbridge_eth.ledger.nodes import Anvil
+
+if TYPE_CHECKING:
+    from eth_account.signers.local import LocalAccount
 
 PROCESSES, WRITES, QUERIES, CONFIRMATIONS = 8, 4, 4, 3
 ETH = 10**18
@@ -71,7 +75,7 @@ class Requests:
         self._sent: dict[bytes, float] = {}
         self._fees = ledger.fees(ledger.block())
 
-    def send(self, account: object, nonce: int, data: bytes, gas: int, value: int = 0) -> None:
+    def send(self, account: LocalAccount, nonce: int, data: bytes, gas: int, value: int = 0) -> None:
         signed = self._ledger.sign(account, data, nonce=nonce, gas=gas, fees=self._fees, value=value)
         before = time.perf_counter()
         [refused] = self._ledger.send([signed.raw])

@@ -19,8 +19,8 @@ from typing import Any
 
 import requests
 from eth_account import Account
+from eth_hash.auto import keccak
 from eth_keys.datatypes import PrivateKey
-from eth_utils.crypto import keccak
 
 from ports import free_port
 
@@ -146,7 +146,7 @@ class Node:
 
     def request(self, method: str, *params: object) -> Any:
         """The result of any JSON-RPC call."""
-        body = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+        body: Any = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
         answer = requests.post(self.url, json=body, timeout=5).json()
         if "error" in answer:
             raise RuntimeError(f"{method}: {answer['error']}")

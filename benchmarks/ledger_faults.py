@@ -264,7 +264,8 @@ class World:
         self.node.floor = self.ledger.block_number()
         self.proxy = Proxy(self.node.url)
         stack.callback(self.proxy.close)
-        self.folder, self.inboxes, self.copy = folder, 0, None
+        self.folder, self.inboxes = folder, 0
+        self.copy: Path | None = None
         self.processes: list[subprocess.Popen[bytes]] = []
         stack.callback(self.stop)
         self.counts: Counter[str] = Counter()

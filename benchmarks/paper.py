@@ -42,6 +42,7 @@ import geth_network
 import load
 import paper_page
 import scale
+from rosbridge_eth.chunk import Chunk, robot_id
 from rosbridge_eth.ledger.submitter import Submitter
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.supervisor import open_store, open_submitter
@@ -181,10 +182,10 @@ def reorganisation(dag: Path) -> Part:
             Path(folder), ours.url, "sqlite", 1, say, keys=keys, confirmations=CONFIRMATIONS["pow"]
         )
         [robot] = operator.robots
-        tk = load.robot_id(robot.name)
+        tk = robot_id(robot.name)
         session = load.Session(operator, robot, ("127.0.0.1", 9))
         sealed = session.seal(300, 15)
-        chunks = [load.Chunk.parse(chunk) for chunk in sealed.values()]
+        chunks = [Chunk.parse(chunk) for chunk in sealed.values()]
         inbox = open_store(operator.config, operator.home)
         submitter = open_submitter(
             operator.config, operator.ledger, inbox, Registry(operator.home.registry), operator.keys

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import scale
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
+from cycler import cycler
 
 STEPS = ("submit", "include", "confirm")
 SAID = {"submit": "accepted by the node", "include": "in a block", "confirm": "two more on top"}
@@ -40,7 +41,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 def draw(figures: Figures, folder: Path) -> list[Path]:
     """Each picture whose figures are there; their files."""
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "paper",
-                         "axes.prop_cycle": matplotlib.cycler(color=COLOURS)})  # fmt: skip
+                         "axes.prop_cycle": cycler(color=COLOURS)})  # fmt: skip
     drawn = []
     for name, parts, make in (("user", {"user"}, _user), ("server", {"server"}, _server),
                               ("chain", {"poa", "pow"}, _chain), ("scale", {"scale"}, _scale)):  # fmt: skip
@@ -190,23 +191,21 @@ The processors are different ones: the rows compare two systems on two machines.
 def _user_section(figures: Figures) -> str:
     part = figures["user"]
     runs, messages = part["runs"], part["messages"]
-    rows = [("delivered", "9,986 of 10,000", f"{part['delivered']:,} of {messages:,}", "")]
-    rows += [
-        (name, paper, *(number(function(run)) for run in runs.values()))
-        for name, paper, function in (
-            ("ms a message, stages added up", "0.852", lambda run: sum(run["stages"].values())),
-            ("of it capture", "", lambda run: run["stages"]["capture"]),
-            ("of it seal (tree, zstd, SM4, SM2)", "0.819 (SM4)", lambda run: run["stages"]["seal"]),
-            ("of it spool, with its fsync", "", lambda run: run["stages"]["spool"]),
-            ("of it send, and take answers", "",
-             lambda run: run["stages"]["send"] + run["stages"]["acknowledgements"]),
-            ("processor, ms a message", "", lambda run: sum(run["processor"].values())),
-            ("least", "0.50 (SM4)", lambda run: run["whole"]["least"]),
-            ("median", "", lambda run: run["whole"]["median"]),
-            ("95 %", "", lambda run: run["whole"]["95 %"]),
-            ("s in all", "8.508", lambda run: sum(run["stages"].values()) * messages / 1000),
-        )
-    ]  # fmt: skip
+    rows: list[tuple[str, ...]] = [("delivered", "9,986 of 10,000", f"{part['delivered']:,} of {messages:,}", "")]
+    stages: tuple[tuple[str, str, Callable[[Any], float]], ...] = (
+        ("ms a message, stages added up", "0.852", lambda run: sum(run["stages"].values())),
+        ("of it capture", "", lambda run: run["stages"]["capture"]),
+        ("of it seal (tree, zstd, SM4, SM2)", "0.819 (SM4)", lambda run: run["stages"]["seal"]),
+        ("of it spool, with its fsync", "", lambda run: run["stages"]["spool"]),
+        ("of it send, and take answers", "",
+         lambda run: run["stages"]["send"] + run["stages"]["acknowledgements"]),
+        ("processor, ms a message", "", lambda run: sum(run["processor"].values())),
+        ("least", "0.50 (SM4)", lambda run: run["whole"]["least"]),
+        ("median", "", lambda run: run["whole"]["median"]),
+        ("95 %", "", lambda run: run["whole"]["95 %"]),
+        ("s in all", "8.508", lambda run: sum(run["stages"].values()) * messages / 1000),
+    )
+    rows += [(name, paper, *(number(function(run)) for run in runs.values())) for name, paper, function in stages]
     head = ["", "the paper", *("a chunk a message" if n == "1" else f"{n} to a chunk" for n in runs)]
     return f"""## User end
 

@@ -85,9 +85,13 @@ def step_by_step(kind: str, seconds: int, folder: Path) -> None:
             chunks.extend(writer.closed(now, 0))
         chunks.extend(writer.finish(0))
 
+    def spool_all() -> None:
+        for chunk in chunks:
+            spool.append(chunk)
+
     spool = Spool(folder / f"{kind}.sqlite", log, max_bytes=1 << 32, drop=lambda chunk: drop(log, key, chunk))
     for name, call in (("capture", capture_all), ("sealing", seal_all),
-                       ("spool", lambda: [spool.append(chunk) for chunk in chunks])):  # fmt: skip
+                       ("spool", spool_all)):  # fmt: skip
         spent = timed(call)
         print(f"{kind}: {name}: {total / spent:.0f} MB/s")
     spool.close()

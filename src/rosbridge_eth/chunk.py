@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from rosbridge_eth import identity
 from rosbridge_eth.errors import VerificationError

@@ -44,6 +44,7 @@ class Relay:
         self.port: int = self._near.getsockname()[1]
         self._client: tuple[str, int] | None = None
         self._held: dict[socket.socket, tuple[bytes, tuple[str, int]]] = {}
+        self.lost = 0  # datagrams
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="relay", daemon=True)
         self._thread.start()
@@ -71,6 +72,7 @@ class Relay:
     def _pass(self, out: socket.socket, data: bytes, to: tuple[str, int]) -> None:
         chance = self._random.random
         if chance() < self._harm.loss:
+            self.lost += 1
             return
         if out not in self._held and chance() < self._harm.reorder:
             self._held[out] = data, to  # goes after the next one

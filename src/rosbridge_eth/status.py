@@ -63,7 +63,7 @@ class Located(NamedTuple):
 
 def locate(home: OperatorHome, ledger: Ledger, robot: str, stream: str, number: int) -> Located:
     """Where a robot's chunk is: in the inbox behind what the chain has, or on the chain, by the links of its events."""
-    from eth_utils.crypto import keccak
+    from eth_hash.auto import keccak
 
     from rosbridge_eth.supervisor import open_store
 

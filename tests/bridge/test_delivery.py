@@ -14,7 +14,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import pytest
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from bridge.channel.simulation import Faults, Network
 from rosbridge_eth import identity as ids

@@ -9,7 +9,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from bridge.machine import PATIENCE, Machine, Running
 from rosbridge_eth import identity as ids

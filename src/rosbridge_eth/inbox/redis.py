@@ -20,7 +20,7 @@ from importlib import resources
 from typing import Any, Final
 
 import redis
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 from redis.backoff import NoBackoff
 from redis.connection import parse_url
 from redis.retry import Retry

@@ -19,7 +19,7 @@ from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import rlp  # type: ignore[import-untyped]
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 from trie.hexary import HexaryTrie
 
 from rosbridge_eth.errors import ChainError, VerificationError
@@ -38,9 +38,9 @@ _LARGEST_BRANCH: Final = 3 + 17 * 33
 _ROBOTS, _BATCH = 2, 4  # slots of RobotLedger.sol
 _SLOTS = 500  # asked for at once; geth proves 1,024, Erigon 1,000
 _OTHERWISE = "an event of the contract is not as Solidity writes it"
-_DATA = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
-_REGISTERED = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
-_REVOKED = keccak(text="Revoked(bytes32,address,uint256,uint256)")
+_DATA = keccak(b"Data(bytes32,uint256,address,uint256,bytes[])")
+_REGISTERED = keccak(b"Registered(bytes32,address,uint256,uint256,bytes)")
+_REVOKED = keccak(b"Revoked(bytes32,address,uint256,uint256)")
 
 
 # RLP

@@ -26,7 +26,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from rosbridge_eth.chunk import Chunk, Header, Malformed
 from rosbridge_eth.errors import ChainError

@@ -284,13 +284,13 @@ class Node:
         """The contract's own error, where `data` holds one."""
         from eth_abi.abi import decode
         from eth_abi.exceptions import DecodingError
-        from eth_utils.crypto import keccak
+        from eth_hash.auto import keccak
 
         try:
             code = bytes.fromhex(str(data.get("data") if isinstance(data, dict) else data).removeprefix("0x"))
             for item in self._abi:
                 types = [entry["type"] for entry in item.get("inputs", ())]
-                if item["type"] == "error" and keccak(text=f"{item['name']}({','.join(types)})")[:4] == code[:4]:
+                if item["type"] == "error" and keccak(f"{item['name']}({','.join(types)})".encode())[:4] == code[:4]:
                     values = decode(types, code[4:])
                     named = zip((entry["name"] for entry in item["inputs"]), values, strict=True)
                     words = ", ".join(f"{n} 0x{v.hex()}" if isinstance(v, bytes) else f"{n} {v}" for n, v in named)

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.chunk import robot_id

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger.contract import BALANCE_LIMIT, NOTHING, Block, DataEvent, Fees, Signed, Standing

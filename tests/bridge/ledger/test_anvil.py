@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 import ledger_faults
 from bridge.ledger.world import ETH, KEYS, World

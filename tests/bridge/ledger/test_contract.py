@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import pytest
 from eth.vm.forks import LondonVM, PragueVM
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 
 from bridge.ledger.world import ETH, KEYS
 from rosbridge_eth.chunk import robot_id

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import rlp
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 from hypothesis import given
 from hypothesis import strategies as st
 from trie.hexary import HexaryTrie
@@ -490,7 +490,7 @@ def test_what_rlp_encodes_is_taken_apart(value: Any):
 @given(st.binary(max_size=400), st.booleans())
 def test_any_receipt_ends_in_events_or_a_sentence(data: bytes, framed: bool):
     address, tk = bytes(20), bytes(32)
-    kind = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
+    kind = keccak(b"Data(bytes32,uint256,address,uint256,bytes[])")
     receipt = rlp.encode([1, 1, bytes(256), [[address, [kind, tk, bytes(32), bytes(32)], data]]]) if framed else data
     with suppress(VerificationError):
         assert all(sum(map(len, event.chunks)) <= len(data) for event in proofs.events_of(receipt, address, tk, 1))
@@ -501,7 +501,7 @@ def test_a_bomb_of_overlapping_chunks_is_refused():
     count, big = 2_000, bytes(60_000)
     words = [0, 64, count, *[32 * count] * count, len(big)]
     data = b"".join(word.to_bytes(32) for word in words) + big
-    kind = keccak(text="Data(bytes32,uint256,address,uint256,bytes[])")
+    kind = keccak(b"Data(bytes32,uint256,address,uint256,bytes[])")
     receipt = rlp.encode([1, 1, bytes(256), [[bytes(20), [kind, bytes(32), bytes(32), bytes(32)], data]]])
     with pytest.raises(VerificationError, match="not as Solidity writes it"):
         list(proofs.events_of(receipt, bytes(20), bytes(32), 1))
@@ -600,7 +600,7 @@ def test_what_no_chain_would_write_is_refused_in_both_languages(what: str, javas
 
 def test_more_registrations_than_anybody_checks_are_refused(javascript):
     """Each costs two signatures of the CA: 25,000 in a file would take a browser ten minutes."""
-    registered = keccak(text="Registered(bytes32,address,uint256,uint256,bytes)")
+    registered = keccak(b"Registered(bytes32,address,uint256,uint256,bytes)")
     text = invented(lambda fields: [*fields[:3], fields[3] * (1_001 if fields[3][0][1][0] == registered else 1)])
     with pytest.raises(VerificationError, match="more than 1,000 registrations"):
         check(text, read_certificates((VECTORS / "ca.crt.pem").read_bytes()))

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from functools import cache
 from typing import Any
 
-from eth_utils.crypto import keccak
+from eth_hash.auto import keccak
 from pydantic import TypeAdapter
 
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id, seal
