@@ -11,6 +11,7 @@ are in it, encrypted under the registration password, and the whole is a sealed 
 from __future__ import annotations
 
 import json
+import logging
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 
@@ -23,6 +24,8 @@ from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
 from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, new_home, require_empty
 from rosbridge_eth.identity import CERTIFICATE_FILES, KEY_FILES, check_name
 from smcrypto import SMCryptoError, sm2, x509
+
+log = logging.getLogger(__name__)
 
 FIRST_CONFIG = """\
 # What this robot sends to the chain; docs/configuration.md describes every key.
@@ -123,7 +126,8 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     """Complete a robot's home with the bundle that answers its request, or make it of a bundle that holds keys.
 
     The CA's fingerprint (SM3 of its certificate, hex), which is to be compared with the operator's: who could change
-    the bundle on its way could have put another there. A home may join again where its keys were certified anew.
+    the bundle on its way could have put another there. A home may join again where its keys were certified anew; its
+    readers are then those of the bundle alone.
     """
     files = {name: content.encode() for name, content in {**bundle.certificates, **bundle.keys}.items()}
     peer = ids.public_identity(b"".join(files.get(name, b"") for name in ("sign.crt.pem", "enc.crt.pem")))
@@ -145,6 +149,12 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
         ids.write_files(home.identity, files)
         for name, pem in bundle.readers.items():
             write_atomically(home.readers / f"{name}.pem", pem.encode())
+        others = sorted(file for file in home.readers.glob("*.pem") if file.stem not in bundle.readers)
+        for file in others:
+            file.unlink()
+        if others:
+            log.warning("no longer sealed for %s: the bundle does not name them; `readers` in robot.toml can",
+                        ", ".join(file.stem for file in others))  # fmt: skip
         home.raise_clock_floor(peer.not_before.timestamp())
         home.save_bridge(bundle.end)
         make_home(home.path, HomeKind.ROBOT, name=bundle.end.robot)

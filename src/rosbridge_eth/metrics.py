@@ -351,6 +351,7 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     SPOOL_DROPPED.labels(name).set(spool.dropped_bodies)
     CONNECTED.labels(name).set(robot.sender.statistics.connected)
     CONDITION.labels("robot has a session").set(robot.sender.statistics.connected)
+    CONDITION.labels("server's name has an address").set(robot.loop.resolved)
     CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)
 
 

@@ -19,16 +19,15 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from socket import socket as Socket
 from typing import TypeVar
 
 from rosbridge_eth.blackbox import BlackBox, Record
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
-from rosbridge_eth.channel.udp import UdpLoop, client_socket
+from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
-from rosbridge_eth.config.values import parse_address, time_text
+from rosbridge_eth.config.values import Address, parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
@@ -66,11 +65,11 @@ class Robot:
     """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
 
     def __init__(
-        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, socket: Socket,
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, server: Address,
         sender: Sender, box: BlackBox | None = None,
     ) -> None:  # fmt: skip
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
-        self.client, self.sender, self.loop = client, sender, UdpLoop(client, socket, self.handle)
+        self.client, self.sender, self.loop = client, sender, ClientLoop(client, server, self.handle)
         sender.begin_stream = self.begin_stream
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
@@ -82,7 +81,8 @@ class Robot:
         self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
-        self._spool_at = self._losses_at = self._synchronised_at = float("-inf")
+        self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
+        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = float("-inf")
         self._synchronised = self._finished = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
@@ -153,9 +153,11 @@ class Robot:
                     self._finish(now)
                 else:
                     self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
-                self._spool_or(None, self.sender.send)
+                self.loop.seek(now)
+                if now >= self._send_at:
+                    self._spool_or(None, "send", self.sender.send)
                 on_turn()
-                if self._finished and not self._unspooled and self._spool_or(False, lambda: self.sender.idle):
+                if self._finished and not self._unspooled and self._spool_or(False, "idle", lambda: self.sender.idle):
                     break
                 self.loop.step(self._wait(now))
             else:
@@ -176,7 +178,7 @@ class Robot:
             finally:
                 self.source.close()
                 reading.join(timeout=5)
-                self.summary = self._spool_or("the spool cannot be read", self._summarise)
+                self.summary = self._spool_or("the spool cannot be read", "sum", self._summarise)
                 self.spool.close()
                 self.loop.close()
         if self._source_error is not None:
@@ -262,17 +264,14 @@ class Robot:
             self._marks.append((last.stream, last.number, self.writer.sealed.copy()))
             if len(self._marks) > MARKS:
                 self._marks = deque([*self._marks][::-2][::-1])
-        if self.spool_trouble.why is not None and now - self._spool_at < SPOOL_AGAIN:
-            return
-        self._spool_at = now
-        try:
-            while self._unspooled:
-                self.spool.append(self._unspooled[0])
-                self._unspooled.popleft()
-        except StoreError as error:
-            self.spool_trouble.now(str(error))
-        else:
-            self.spool_trouble.now(None)
+        if "append" not in self._failing or now - self._spool_at >= SPOOL_AGAIN:
+            self._spool_at = now
+            self._spool_or(None, "append", self._append)
+
+    def _append(self) -> None:
+        while self._unspooled:
+            self.spool.append(self._unspooled[0])
+            self._unspooled.popleft()
 
     def _wait(self, now: float) -> float:
         if (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
@@ -283,24 +282,32 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.statistics.connected and not self._spool_or(True, lambda: self.sender.idle):
+        while self.sender.statistics.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
             if (now := time.monotonic()) >= deadline:
                 break
             self._spool_chunks([], now)
-            self._spool_or(None, self.sender.send)
+            self._spool_or(None, "send", self.sender.send)
             self.loop.step(0.02)
 
     def handle(self, event: Event) -> None:
-        """Take one event of the client. What the spool cannot note at this moment the server says again."""
-        self._spool_or(None, partial(self.sender.handle, event, time.monotonic()))
+        """Take one event of the client. What the spool cannot note is asked for again, a second later."""
+        now = time.monotonic()
+        self._spool_or(None, "note", partial(self.sender.handle, event, now))
+        self._send_at = now + SPOOL_AGAIN if "note" in self._failing else now
 
-    def _spool_or(self, otherwise: _T, call: Callable[[], _T]) -> _T:
-        """What `call` gives, or `otherwise` where the spool does not work; a full disk does not end a robot."""
+    def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
+        """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
+
+        A spool may do one thing and not another: it is well again when all that it did not do is done.
+        """
         try:
-            return call()
+            given = call()
         except StoreError as error:
-            self.spool_trouble.now(str(error))
-            return otherwise
+            self._failing[what], given = str(error), otherwise
+        else:
+            self._failing.pop(what, None)
+        self.spool_trouble.now(next(iter(self._failing.values()), None))
+        return given
 
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender.statistics
@@ -384,13 +391,10 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
         wall=certificate_clock(home),
     )
     sender = Sender(client, spool, channel=config.channel, on_server_time=partial(keep_time, home))
-    socket, address = client_socket(config.server or parse_address(end.server_address))
-    robot = Robot(
-        source=source, capture=capture, writer=writer, spool=spool, client=client, socket=socket, sender=sender,
-        box=box,
+    return Robot(
+        source=source, capture=capture, writer=writer, spool=spool, client=client,
+        server=config.server or parse_address(end.server_address), sender=sender, box=box,
     )
-    client.connect(address, now)
-    return robot
 
 
 def read_again(robot: Robot, home: RobotHome, running: RobotConfig, file: Path) -> RobotConfig:

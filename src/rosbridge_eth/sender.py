@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from rosbridge_eth import protocol
-from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason
+from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason, Unresolved
 from rosbridge_eth.chunk import MAX_CHUNK
-from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.errors import NetworkError, StoreError
 from rosbridge_eth.protocol import MAX_PART, Confirmed, Have, Hold, Offer, Part, ProtocolError, Refused, Stored, Where
 from rosbridge_eth.spool import Spool
 
@@ -138,7 +138,8 @@ class Sender:
             self._flying.clear()
 
     def handle(self, event: Event, now: float) -> None:
-        """Take one event of the client. Raises NetworkError where the server says what is no message of ours."""
+        """Take one event of the client. Raises NetworkError where the server says what is no message of ours, and
+        StoreError where the spool cannot note it; then it is asked for again."""
         match event:
             case Connected(peer=peer, server_time=server_time):
                 self.statistics.sessions += 1
@@ -151,8 +152,9 @@ class Sender:
             case Disconnected(reason=reason):
                 self.statistics.connected, self.statistics.held = False, None
                 log.info("disconnected: %s", reason)
-            case HandshakeFailed(why=why):
-                self.statistics.refusal = f"{why}; {mend(event, self._channel)}"
+            case HandshakeFailed(why=why) | Unresolved(why=why):
+                todo = "" if isinstance(event, Unresolved) else f"; {mend(event, self._channel)}"
+                self.statistics.refusal = why + todo
                 if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:  # not at every attempt
                     self._said[why] = now
                     log.warning("no session: %s", self.statistics.refusal)
@@ -163,6 +165,9 @@ class Sender:
                     raise NetworkError(
                         f"the server says what is no message here ({error}); use the same version on both ends"
                     ) from error
+                except StoreError:  # not noted: ask again, and the server says it again
+                    self._stream, self._asked = None, False
+                    raise
 
     def _take(self, message: protocol.Down, now: float) -> None:
         match message:

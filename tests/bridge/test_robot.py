@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -14,10 +15,12 @@ import pytest
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, HandshakeFailed, Message
-from rosbridge_eth.channel.udp import client_socket, server_sockets
+from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.config import Address
+from rosbridge_eth.database import DiskFull
 from rosbridge_eth.errors import NetworkError, StoreError
-from rosbridge_eth.protocol import Confirmed
+from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
 from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.sender import Sender
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
@@ -63,10 +66,9 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
         client = Client(ClientConfig(), who, ids.Trust((ca.certificate,)), "hub", now)
         writer = LogWriter(PLACE, who.signing_key, [who.encryption_key.public_key], previous=bytes(32),
                            stream_line=stream_line("bag", "test"), period=0.001, now=now)
-        socket, address = client_socket(nobody.getsockname()[:2])
-        client.connect(address, now)
         return Robot(source=Source(count), capture=Capture([TopicRule(TOPIC)], source_kind="bag"), writer=writer,
-                     spool=spool, client=client, socket=socket, sender=Sender(client, spool))
+                     spool=spool, client=client, sender=Sender(client, spool),
+                     server=Address(*nobody.getsockname()[:2]))
 
     yield made
     nobody.close()
@@ -130,6 +132,61 @@ def test_a_spool_that_cannot_be_read_does_not_end_a_robot(
     assert turns == 10
     assert robot.summary == "the spool cannot be read"
     assert "the disk is gone" in caplog.text
+
+
+def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_is_well(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, sends, away = make(3000), list[bool](), [True]
+
+    def send() -> None:
+        sends.append(away[0])
+        if away[0]:
+            raise StoreError("a page of it cannot be read")
+
+    monkeypatch.setattr(robot.sender, "send", send)
+    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.0)
+
+    def on_turn() -> None:
+        if robot.captured == 3000 and not robot._unspooled:
+            if away[0]:
+                said = [line for line in caplog.messages if line.startswith("the spool: ")]
+                assert said == ["the spool: a page of it cannot be read"] and robot.chunks > 3 and len(sends) > 3
+            away[0] = False
+            if not sends[-1]:
+                robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: well again"]
+
+
+def test_an_answer_that_the_spool_could_not_note_is_asked_for_again(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, sent = make(10), list[bytes]()
+    sender, spool = robot.sender, robot.spool
+    with closing(spool), closing(robot.loop):
+        monkeypatch.setattr(robot.client, "writable", lambda size=0: True)
+        monkeypatch.setattr(robot.client, "send", sent.append)
+        [chunk] = robot.writer.finish(0)
+        spool.append(chunk)
+        place = chunk.header.stream, chunk.header.number, chunk.header.digest
+        sender.statistics.connected = True
+        sender.send()
+        assert sent == [encode(Where(*place))]
+        lost, full = spool.lost, DiskFull("the disk is full; make room")
+
+        def fails(*given: object) -> None:
+            raise full
+
+        monkeypatch.setattr(spool, "lost", fails)
+        robot.handle(Message(b"", encode(Stored(*place)), robot.client))  # type: ignore[arg-type]
+        assert robot.spool_trouble.why == str(full) and not sender.idle
+        monkeypatch.setattr(spool, "lost", lost)
+        sender.send()
+        assert sent[1:] == sent[:1], "it asks again"
+        robot.handle(Message(b"", encode(Stored(*place)), robot.client))  # type: ignore[arg-type]
+        assert robot.spool_trouble.why is None and sender.idle
 
 
 class Full:

@@ -9,6 +9,7 @@ from rosbridge_eth.channel.client import Client
 
 from rosbridge_eth.channel.events import (  # isort: skip
     ClientConfig, Connected, Disconnected, Drop, End, Event, Full, HandshakeFailed, Message, NotConnected, ServerConfig,
+    Unresolved,
 )  # fmt: skip
 from rosbridge_eth.channel.handshake import Randomness
 from rosbridge_eth.channel.server import Server, cookie_key
@@ -16,5 +17,6 @@ from rosbridge_eth.channel.wire import Mode, Reason
 
 __all__ = [
     "Address", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End", "Event", "Full", "HandshakeFailed",
-    "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server", "ServerConfig", "cookie_key",
+    "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server", "ServerConfig",
+    "Unresolved", "cookie_key",
 ]  # fmt: skip

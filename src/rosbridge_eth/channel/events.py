@@ -90,7 +90,14 @@ class HandshakeFailed(NamedTuple):
     hint: Reason | None = None
 
 
-Event = Connected | Disconnected | Message | HandshakeFailed
+class Unresolved(NamedTuple):
+    """At a client: its server's name has no address at this moment; it is asked for again. why: as of HandshakeFailed,
+    with what to do."""
+
+    why: str
+
+
+Event = Connected | Disconnected | Message | HandshakeFailed | Unresolved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

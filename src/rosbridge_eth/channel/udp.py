@@ -15,12 +15,14 @@ import select
 import socket
 import struct
 import sys
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.client import Client
-from rosbridge_eth.channel.events import Event
+from rosbridge_eth.channel.client import Client, State
+from rosbridge_eth.channel.events import Event, Unresolved
 from rosbridge_eth.channel.server import Server
 from rosbridge_eth.errors import NetworkError
 
@@ -28,6 +30,7 @@ RECEIVE_BUFFER = 4 << 20  # bytes: about 3,500 full datagrams while the process 
 SEND_BUFFER = 1 << 20
 LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
 BATCH = 128  # datagrams taken before events are handed out and answers sent
+ASK_AGAIN = 10.0  # seconds between questions for the address of a server with which there is no session
 
 _SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
 
@@ -48,7 +51,10 @@ def _resolve(host: str, port: int, flags: int = 0) -> tuple[int, Address]:
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags)
     except (socket.gaierror, UnicodeError) as error:  # the latter for what cannot be a name
-        raise NetworkError(f"the address {host!r} cannot be found: {getattr(error, 'strerror', error)}") from error
+        raise NetworkError(
+            f"the address {host!r} cannot be found: {getattr(error, 'strerror', error)}; see that this machine has a"
+            " network and a name server, and that the name is right"
+        ) from error
     family, _, _, _, place = found[0]
     return family, (str(place[0]), int(place[1]))
 
@@ -190,3 +196,52 @@ class UdpLoop:
                 send(data, address)
             except (OSError, OverflowError):  # a full buffer, no route, port 0: the channel sends again what matters
                 self.lost_sends += 1
+
+
+class ClientLoop(UdpLoop):
+    """Drives a client whose server is given by name: one that has no address yet, as before the network is up, or
+    another one tomorrow."""
+
+    def __init__(self, client: Client, server: Address, on_event: Callable[[Event], None]) -> None:
+        super().__init__(client, _open(socket.AF_INET), on_event)
+        self.resolved = True
+        """False while there is no session and the name has no address."""
+        self._client, self._server = client, server
+        self._address: Address | None = None
+        self._answer: Future[tuple[int, Address]] | None = None
+        self._ask_at = float("-inf")
+
+    def seek(self, now: float) -> None:
+        """While there is no session: ask for the server's address, and connect to a new one. Call it in each turn."""
+        if self._client.state is State.CONNECTED:
+            self.resolved = True
+            return
+        if self._answer is not None and self._answer.done():
+            answer, self._answer = self._answer, None
+            try:
+                self._take(*answer.result(), now)
+            except NetworkError as error:
+                self.resolved = False
+                self._on_event(Unresolved(str(error)))
+        elif self._answer is None and now >= self._ask_at:
+            self._answer, self._ask_at = Future(), now + ASK_AGAIN
+            # A thread of its own: getaddrinfo may wait half a minute for a name server, and cannot be told to stop.
+            threading.Thread(target=self._ask, args=(self._answer,), name="resolver", daemon=True).start()
+
+    def _ask(self, answer: Future[tuple[int, Address]]) -> None:
+        try:
+            answer.set_result(_resolve(*self._server))
+        except NetworkError as error:
+            answer.set_exception(error)
+        self.wake()
+
+    def _take(self, family: int, address: Address, now: float) -> None:
+        self.resolved = True
+        if family != self.socket.family:
+            self._poll.unregister(self.socket)
+            self.socket.close()
+            self.socket = _open(family)
+            self._poll.register(self.socket, select.POLLIN)
+        if address != self._address:
+            self._address = address
+            self._client.connect(address, now)

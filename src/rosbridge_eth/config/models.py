@@ -374,7 +374,7 @@ class RobotConfig(Section):
     channel: How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.
 
     readers: Certificates (PEM) of those who may read the records, 16 at most; without it, those in the folder `readers`
-    of the home.
+    of the home: the bundle's and what is put there by hand. A bundle that is taken up removes what it does not name.
 
     monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there are none.
     Keep it on the machine or a private network.
@@ -542,8 +542,8 @@ class FundsConfig(Section):
     records a second.
     """
 
-    below: float = Field(default=0.05, gt=0, lt=5)
-    by: float = Field(default=0.5, gt=0, le=5)
+    below: float = Field(default=0.05, ge=1e-6, lt=5)
+    by: float = Field(default=0.5, ge=1e-6, le=5)
     gas_per_day: int = Field(default=30_000_000_000, ge=1_000_000)
 
 

@@ -22,9 +22,10 @@ from rosbridge_eth.channel import (
     Message,
     Server,
     ServerConfig,
+    Unresolved,
     cookie_key,
 )
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import ClientLoop, UdpLoop, client_socket, server_sockets
 from rosbridge_eth.channel.wire import HELLO_PADDING, Hello, Kind, Mode
 from rosbridge_eth.errors import NetworkError
 
@@ -168,6 +169,73 @@ def test_an_address_of_another_machine_is_an_error_with_its_own_way_out():
 def test_a_name_that_does_not_exist_is_an_error(name):
     with pytest.raises(NetworkError, match=f"the address {name!r} cannot be found"):
         client_socket((name, 1))
+
+
+class Names:
+    """A name server that knows one name; while `gate` is clear it does not answer."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.address: tuple[str, int] | None = None
+        self.gate, self.asked, self._real = threading.Event(), 0, socket.getaddrinfo
+        self.gate.set()
+        monkeypatch.setattr(socket, "getaddrinfo", self)
+        monkeypatch.setattr("rosbridge_eth.channel.udp.ASK_AGAIN", 0.02)
+
+    def __call__(self, host: str, *rest: object, **more: object) -> object:
+        if host != "robots.example":
+            return self._real(host, *rest, **more)  # type: ignore[arg-type]
+        self.asked += 1
+        assert self.gate.wait(PATIENCE)
+        if self.address is None:
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        return self._real(*self.address, type=socket.SOCK_DGRAM)
+
+
+class NamedRobot(Robot):
+    """A robot that knows its server by name."""
+
+    def __init__(self) -> None:
+        self.client = Client(ClientConfig(patience=0.3), ROBOTS[0], TRUST, "hub", time.monotonic())
+        self.events: list[object] = []
+        self.loop = ClientLoop(self.client, ("robots.example", 7410), self.events.append)
+        step = self.loop.step
+
+        def seeking(longest: float) -> None:
+            self.loop.seek(time.monotonic())
+            step(longest)
+
+        self.loop.step = seeking
+
+
+def test_a_name_is_asked_for_until_it_has_an_address_and_again_when_the_session_is_lost(monkeypatch):
+    names, robot = Names(monkeypatch), NamedRobot()
+    robot.until(lambda: sum(isinstance(event, Unresolved) for event in robot.events) == 3)
+    assert robot.events[0].why.startswith("the address 'robots.example' cannot be found: Temporary failure")
+    assert not robot.loop.resolved and robot.client.state == "idle"
+    places = [("127.0.0.1", 0), ("::1", 0)] if socket.has_ipv6 else [("127.0.0.1", 0)] * 2
+    for number, place in enumerate(places):  # the second time, the server has moved
+        worker = Worker(number, server_sockets(place)[0])
+        names.address = worker.loop.socket.getsockname()[:2]
+        robot.until(lambda: robot.client.state == "connected")
+        robot.ask([b"are you there?"])
+        asked = names.asked
+        robot.ask([b"still there?"])
+        assert robot.loop.resolved and names.asked == asked, "nobody is asked while the session stands"
+        worker.stop()
+        robot.client.expecting(True)
+        robot.until(lambda: robot.client.state != "connected")
+    robot.close()
+
+
+def test_a_name_server_that_does_not_answer_keeps_nobody_waiting(monkeypatch):
+    names = Names(monkeypatch)
+    names.gate.clear()
+    robot = NamedRobot()
+    for _ in range(20):
+        robot.loop.step(0.0)
+    assert names.asked == 1 and robot.events == []
+    robot.loop.close()
+    names.gate.set()  # and its answer finds nobody
 
 
 def test_nobody_at_the_other_end_is_not_an_error_of_the_socket():

@@ -211,6 +211,8 @@ def test_a_mistake_in_robot_toml_is_told(text):
         ("passphrase_file = 1", "passphrase_file is 1; write a path in quotes"),
         ("[funds]\ngas_per_day = 5", "funds.gas_per_day is 5; it should be at least 1000000"),
         ("[funds]\nby = 6", "funds.by is 6; it should be at most 5"),
+        ("[funds]\nby = 4e-19", "funds.by is 4e-19; it should be at least 1e-06"),
+        ("[funds]\nbelow = 4e-19", "funds.below is 4e-19; it should be at least 1e-06"),
         ("[store]\nurl = 3", "store.url is 3; it should be a string in quotes"),
         ("[stroe]\nshare = 10", "unknown key 'stroe'; did you mean 'store'?"),
     ],

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle
+from rosbridge_eth.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle, take_up
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.identity import Role, load_identity
@@ -210,3 +210,29 @@ def test_a_crash_while_joining_is_mended_by_joining_again(home: RobotHome, monke
         monkeypatch.setattr(os, "replace", real)
         join(home, bundle)
         assert load_identity(home.identity, b"robot's")[0].name == "robot_1" and home.bridge() == END
+
+
+def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_crash_fell(
+    home: RobotHome, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    pem, real = READER.pem.decode(), Path.unlink
+    before = replace(bundle, readers={"owner": pem, "stays": pem, "goes": pem})
+    after = replace(bundle, readers={"owner": pem, "stays": pem, "comes": pem})
+
+    def dies(path: Path, missing_ok: bool = False) -> None:
+        if path.suffix == ".pem":
+            raise KeyboardInterrupt
+        real(path, missing_ok)
+
+    join(home, before)
+    (home.readers / "by_hand.pem").write_text(pem)
+    (home.readers / "note.txt").write_text("not a certificate")
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "unlink", dies)
+        join(home, after)
+    assert after.readers.keys() <= {file.stem for file in home.readers.glob("*.pem")}, "nobody is left out"
+    home.answer.write_bytes(after.encode())
+    take_up(home)
+    assert {file.name for file in home.readers.iterdir()} == {"owner.pem", "stays.pem", "comes.pem", "note.txt"}
+    assert "no longer sealed for by_hand, goes" in caplog.text and not home.answer.exists()

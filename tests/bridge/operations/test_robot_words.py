@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import socket
 from contextlib import closing
 from datetime import UTC, datetime
 from functools import partial
@@ -14,6 +15,7 @@ import pytest
 from bridge import disks
 from bridge.lone_robot import CA, NOW, READER, lone_robot
 from bridge.operations.conftest import PASSWORD, Place
+from rosbridge_eth import metrics
 from rosbridge_eth import robot as module
 from rosbridge_eth.channel import ClientConfig, Connected, HandshakeFailed, Reason
 from rosbridge_eth.chunk import MAX_READERS
@@ -107,6 +109,28 @@ def test_a_mode_that_the_server_may_not_take_is_named(
     robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal else None)
     [said] = warnings(caplog)
     assert 'channel = "transport"' in said
+
+
+def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_capturing(
+    place: Place, monkeypatch: pytest.MonkeyPatch, caplog: Logged
+) -> None:
+    def away(*given: object, **more: object) -> object:
+        raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+
+    monkeypatch.setattr(socket, "getaddrinfo", away)
+    robot = opened(place, f'server = "robots.example:7410"\n{ODOM}{BAG}')
+    captured = robot.source.message_count  # type: ignore[attr-defined]
+    with metrics.shared(place.robot.path):
+        def on_turn() -> None:
+            metrics.show_robot("robot_1", robot, 0.0)
+            if robot.captured == captured and robot.sender.statistics.refusal:
+                robot.stop()
+
+        robot.run(on_turn=on_turn)
+        assert not metrics.conditions(metrics.collected(place.robot.path), (), 0.0)["server's name has an address"]
+    [said] = warnings(caplog)
+    why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
+    assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary
 
 
 def test_a_robot_that_is_stopped_before_any_answer_says_so(place: Place) -> None:
