@@ -39,8 +39,9 @@ from eth_hash.auto import keccak
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.config import Address
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
@@ -238,11 +239,10 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     spool, now = who.spool(folder / "spool-2.sqlite"), time.monotonic()
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
     sender = Sender(client, spool)
-    near, address = client_socket(("127.0.0.1", port))
-    client.connect(address, now)
     robot = Robot(
         source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
-        writer=who.writer(0.05, now), spool=spool, client=client, socket=near, sender=sender,
+        writer=who.writer(0.05, now), spool=spool, client=client, sender=sender,
+        server=Address("127.0.0.1", port),
     )  # fmt: skip
     started = time.perf_counter()
     robot.run()
