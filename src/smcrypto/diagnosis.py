@@ -2,7 +2,7 @@
 
 `diagnose` takes what somebody was given (hex, base64, PEM, DER or bytes), names every form of SM2 that it can be,
 tries a key and a message on it, and gives the calls that read it: here, in gmssl (Python, 3.2.2), sm-crypto
-(JavaScript, 0.4), Bouncy Castle (Java, 1.78) and openssl (3.0).
+(JavaScript, 0.5.8), Bouncy Castle (Java, 1.78) and openssl (3.0).
 
 For one's own desk. It tells one failure from another, with a private key in hand; `decrypt` and `verify` do not, on
 purpose. A service that shows its answers to others is an oracle (Bleichenbacher, CRYPTO 1998).
@@ -148,10 +148,14 @@ def _unwrapped(data: bytes, remarks: list[str]) -> Iterator[tuple[str, bytes]]:
     """(how it was written, the bytes) for each way in which `data` can be read; hex in base64 and the like too."""
     if b"-----BEGIN " in data:
         try:
-            for label, content in pem.decode(data):
-                yield f"PEM, label {label}", content
+            blocks = pem.decode(data)
         except InvalidEncoding as error:
             remarks.append(str(error))
+            return
+        if not blocks:
+            remarks.append("-----BEGIN stands there, but no line is a PEM boundary: is it indented, or one line?")
+        for label, content in blocks:
+            yield f"PEM, label {label}", content
         return
     text = re.sub(rb"[\s:]", b"", data)
     if match := _HEX.fullmatch(text):

@@ -1,8 +1,8 @@
 """PEM, the textual armour of DER: RFC 7468.
 
 Reading takes what is in the field around a block: explanatory text before,
-between and after blocks, CRLF or LF, trailing blanks, lines of any length, and
-several blocks in one file. Inside a block it is strict: base64 with correct
+between and after blocks, a byte order mark, CRLF or LF, trailing blanks, lines of
+any length, and several blocks in one file. Inside a block it is strict: base64 with correct
 padding and no stray bits (RFC 4648, 3.5), the END line that belongs to the
 BEGIN line. Headers of RFC 1421 ("Proc-Type: 4,ENCRYPTED") are refused; they are
 OpenSSL's old key encryption, which derives its key by one MD5.
@@ -11,6 +11,7 @@ OpenSSL's old key encryption, which derives its key by one MD5.
 from __future__ import annotations
 
 import binascii
+import codecs
 import re
 from collections.abc import Iterable
 from typing import Final, NamedTuple
@@ -47,7 +48,7 @@ def decode(data: BytesLike) -> list[Block]:
     blocks: list[Block] = []
     label: bytes | None = None
     body: list[bytes] = []
-    for line in _LINE_END.split(as_bytes(data, "data")):
+    for line in _LINE_END.split(as_bytes(data, "data").removeprefix(codecs.BOM_UTF8)):
         match = _BOUNDARY.fullmatch(line)
         if match and _NO_LABEL.search(match[2]):
             match = None

@@ -224,6 +224,8 @@ def test_a_key_that_cannot_be_written_leaves_nothing_behind(folder: Path, capsys
     (["encrypt", "--to", "pub.pem", "--password-file", "password", "message"], "without a password"),
     (["decrypt", "--password-file", "password", "empty"], "Salted__"),
     (["keygen", "-o", "new.pem", "--format", "sec1", "--password-file", "password"], "SEC1"),
+    (["keygen", "-o", "new.pem", "--public", "new.pem"], "the same file"),
+    (["keygen", "-o", "absent/new.pem"], "absent/new.pem: No such file"),
     (["verify", "--public", "message", "--signature", "message", "message"], "smcrypto: "),
     (["hmac", "--key-file", "absent", "message"], "absent: No such file"),
     (["hash", "."], "Is a directory"),
@@ -328,12 +330,15 @@ def test_stdin_is_read_where_no_file_is_named(
         assert capsys.readouterr().out == f"{ABC_DIGEST}  -\n"
 
 
-def test_an_interrupt_has_its_exit_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error, code", [(KeyboardInterrupt, 130), (MemoryError, 1)])
+def test_what_stops_a_command_has_its_exit_code(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: type[BaseException], code: int
+) -> None:
     def interrupted(name: str) -> Iterator[bytes]:
-        raise KeyboardInterrupt
+        raise error
 
     monkeypatch.setattr(digest, "chunks", interrupted)
-    assert main(["hash", "message"]) == 130
+    assert main(["hash", "message"]) == code
 
 
 def test_version_and_help_name_every_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -529,6 +534,27 @@ def test_output_into_a_device_does_not_replace_it(keys: Path, tmp_path: Path) ->
     finally:
         os.close(reader)
     assert stat.S_ISFIFO(os.stat("fifo").st_mode)
+
+
+def test_output_through_a_link_goes_where_it_leads(keys: Path) -> None:
+    Path("target").write_bytes(b"old")
+    Path("link").symlink_to("target")
+    assert main(["pubkey", "--key", "key.pem", "-o", "link"]) == 0
+    assert Path("link").is_symlink() and Path("target").read_bytes() == Path("pub.pem").read_bytes()
+
+
+@pytest.mark.parametrize("command, closed, code, out, err", [
+    ("hash message", "<&-", 0, True, False), ("hash", "<&-", 1, False, True), ("hash message", ">&-", 1, False, True),
+    ("keygen --encrypt -o new.pem", "<&-", 1, False, True), ("pubkey --key key.pem", ">&-", 1, False, True),
+    ("hash absent", "2>&-", 1, False, False), ("pubkey --key key.pem -o new.pem", "<&- >&- 2>&-", 0, False, False),
+])  # fmt: skip
+def test_streams_that_were_closed_before(
+    keys: Path, command: str, closed: str, code: int, out: bool, err: bool
+) -> None:
+    done = subprocess.run(["sh", "-c", f"{sys.executable} -m smcrypto {command} {closed}"], capture_output=True,
+                          check=False, env=ENVIRONMENT)  # fmt: skip
+    assert (done.returncode, bool(done.stdout)) == (code, out)
+    assert done.stderr.count(b"\n") == err and (b"closed" in done.stderr or b"a password" in done.stderr) == err
 
 
 def test_a_distinguishing_id_is_the_bytes_of_the_command_line(keys: Path) -> None:

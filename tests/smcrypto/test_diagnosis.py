@@ -185,6 +185,9 @@ def test_what_is_nearly_something_has_a_remark() -> None:
     assert "31 hex digits" not in str(diagnose("0" * 32))
     assert "odd number" in diagnose(D[:-1]).remarks[0]
     assert "END line" in diagnose(KEY.to_pem()[:-10]).remarks[0]
+    for written in (b"  " + KEY.to_pem(), KEY.to_pem().replace(b"\n", b"\\n")):
+        assert "no line is a PEM boundary" in diagnose(written).remarks[0]
+    assert diagnose(b"\xef\xbb\xbf" + KEY.to_pem()).readings == diagnose(KEY.to_pem()).readings
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec
 
@@ -241,6 +244,8 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "private key: DER, encrypted" in capsys.readouterr().out
     assert main(["diagnose", f"{at}/message"]) == 1
     assert "nothing of SM2" in capsys.readouterr().err
+    assert main(["diagnose", "/dev/zero"]) == 1  # which has no end
+    assert "at most 1048576 bytes" in capsys.readouterr().err
 
 
 def test_a_points_64_bytes_are_no_signature() -> None:

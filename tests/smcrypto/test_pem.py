@@ -33,6 +33,7 @@ def test_what_is_written_is_what_the_standard_library_writes(data: bytes) -> Non
         BLOCK + b"text after it\n",
         BLOCK[:-1],
         b"-----END NOTHING-----\n" + BLOCK,
+        b"\xef\xbb\xbf" + BLOCK,  # as Windows' editors save it, and OpenSSL reads it
         b"\xff\xfe not text at all \x00\n" + BLOCK,
     ],
 )

@@ -49,6 +49,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; every failure the user can act on is one line on stderr, never a traceback."""
+    # Python has None for a stream that was closed before it came; what stands in its place refuses all but to be there.
+    sys.stdin, sys.stdout = sys.stdin or open(os.devnull, "w"), sys.stdout or open(os.devnull)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     options = build_parser().parse_args(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files and people go to terminals that cannot write them
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -59,7 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Who reads our output has seen enough; what Python would flush at its end goes nowhere.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (SMCryptoError, OSError) as error:
+    except io.UnsupportedOperation:
+        print("smcrypto: stdin or stdout is closed", file=sys.stderr)
+        return 1
+    except (SMCryptoError, OSError, MemoryError) as error:
         name = getattr(error, "filename", None)
         text = f"{name}: {error.strerror}" if isinstance(error, OSError) and name else str(error)
         print(f"smcrypto: {text or type(error).__name__}", file=sys.stderr)

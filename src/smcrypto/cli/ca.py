@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from typing import TypeVar
 
 from smcrypto import pem, sm2, x509
 from smcrypto.cli import passwords
@@ -136,14 +138,25 @@ def _days(options: argparse.Namespace) -> tuple[datetime, datetime]:
     return now, now + timedelta(days=options.days)
 
 
+_T = TypeVar("_T")
+
+
+def _read(path: Path, load: Callable[[bytes], _T]) -> _T:
+    """What `load` makes of the file; its CertificateError names the file, as a command has several."""
+    try:
+        return load(path.read_bytes())
+    except CertificateError as error:
+        raise CertificateError(f"{path}: {error}") from None
+
+
 def _authority(options: argparse.Namespace) -> tuple[x509.Certificate, sm2.PrivateKey]:
-    certificate = x509.Certificate.from_pem((options.dir / "ca.crt.pem").read_bytes())
+    certificate = _read(options.dir / "ca.crt.pem", x509.Certificate.from_pem)
     return certificate, load_private(options.dir / "ca.key.pem", options)
 
 
 def run_init(options: argparse.Namespace) -> int:
-    key_file, certificate_file = options.dir / "ca.key.pem", options.dir / "ca.crt.pem"
-    for path in (key_file, certificate_file):
+    key_file, certificate_file, crl_file = (options.dir / f"ca.{kind}.pem" for kind in ("key", "crt", "crl"))
+    for path in (key_file, certificate_file, crl_file):
         require_absent(path, force=options.force)
     begin, end = _days(options)
     key = sm2.PrivateKey.generate()
@@ -157,6 +170,7 @@ def run_init(options: argparse.Namespace) -> int:
     options.dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     write_private(key_file, key.to_pem(password=password, prf=options.prf), force=options.force)
     write_output(certificate_file, [certificate.to_pem()])
+    crl_file.unlink(missing_ok=True)  # of the CA that was overwritten
     print(f"{certificate_file}: {certificate.subject}, SM3 fingerprint {certificate.fingerprint().hex()}",
           file=sys.stderr)
     return 0
@@ -205,13 +219,13 @@ def run_revoke(options: argparse.Namespace) -> int:
     entries: list[x509.RevokedCertificate] = []
     number = 0
     if path.exists():
-        old = x509.CertificateRevocationList.from_pem(path.read_bytes())
+        old = _read(path, x509.CertificateRevocationList.from_pem)
         old.verify(certificate, uid=uid)
         entries += old.revoked
         number = (old.number or 0) + 1
     begin, end = _days(options)
     for file in options.certificates:
-        revoked = x509.Certificate.from_pem(file.read_bytes())
+        revoked = _read(file, x509.Certificate.from_pem)
         revoked.verify_signature(certificate, uid=uid)
         if all(entry.serial_number != revoked.serial_number for entry in entries):
             entries.append(x509.RevokedCertificate(revoked.serial_number, begin, options.reason))
@@ -224,20 +238,16 @@ def run_revoke(options: argparse.Namespace) -> int:
 
 
 def run_verify(options: argparse.Namespace) -> int:
-    leaf, *rest = x509.load_pem_certificates(options.certificate.read_bytes())
+    leaf, *rest = _read(options.certificate, x509.load_pem_certificates)
     if options.intermediates is not None:
-        rest += x509.load_pem_certificates(options.intermediates.read_bytes())
+        rest += _read(options.intermediates, x509.load_pem_certificates)
+    roots = _read(options.roots, x509.load_pem_certificates)
+    crls = [_read(file, x509.CertificateRevocationList.from_pem) for file in options.crl]
     try:
         path = x509.verify_chain(
-            leaf,
-            intermediates=rest,
-            roots=x509.load_pem_certificates(options.roots.read_bytes()),
-            at=_moment(options.at),
-            uid=uid_bytes(options.uid),
-            extended_key_usage=options.extended_key_usage,
-            key_usage=options.key_usage,
-            crls=[x509.CertificateRevocationList.from_pem(file.read_bytes()) for file in options.crl],
-        )
+            leaf, intermediates=rest, roots=roots, at=_moment(options.at), uid=uid_bytes(options.uid),
+            extended_key_usage=options.extended_key_usage, key_usage=options.key_usage, crls=crls,
+        )  # fmt: skip
     except CertificateError as error:
         print(f"smcrypto: not trusted: {error}", file=sys.stderr)
         return 1
@@ -249,9 +259,12 @@ def _moment(text: str | None) -> datetime:
     if text is None:
         return datetime.now(timezone.utc)
     try:
-        return datetime.fromisoformat(text[:-1] + "+00:00" if text.endswith("Z") else text)  # Python 3.10 knows no Z
+        moment = datetime.fromisoformat(text[:-1] + "+00:00" if text.endswith("Z") else text)  # Python 3.10 knows no Z
     except ValueError:
-        raise InvalidOption("--at takes a time such as 2026-01-31T12:00:00Z") from None
+        moment = datetime.min
+    if moment.tzinfo is None:
+        raise InvalidOption("--at takes a time such as 2026-01-31T12:00:00Z")
+    return moment
 
 
 # --- show ---
@@ -260,11 +273,11 @@ def _moment(text: str | None) -> datetime:
 def run_show(options: argparse.Namespace) -> int:
     shown = 0
     for label, content in pem.decode(read_all(options.file)):
-        if label == "CERTIFICATE":
+        if label in x509.Certificate.LABELS:
             print(_describe_certificate(x509.Certificate.from_der(content)))
-        elif label in ("CERTIFICATE REQUEST", "NEW CERTIFICATE REQUEST"):
+        elif label in x509.CertificateSigningRequest.LABELS:
             print(_describe_request(x509.CertificateSigningRequest.from_der(content)))
-        elif label == "X509 CRL":
+        elif label in x509.CertificateRevocationList.LABELS:
             print(_describe_crl(x509.CertificateRevocationList.from_der(content)))
         else:
             continue

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import islice
 from pathlib import Path
 
 from smcrypto.cli import passwords
-from smcrypto.cli.files import add_input, read_all
+from smcrypto.cli.files import add_input, chunks
 from smcrypto.cli.keys import uid_bytes
 
 __all__ = ["add_parser"]
@@ -32,7 +33,7 @@ def run_diagnose(options: argparse.Namespace) -> int:
 
     password = passwords.read_password(options, "Password") if passwords.named(options) else None
     found = diagnose(
-        read_all(options.file),
+        b"".join(islice(chunks(options.file), 2)),  # enough to be refused for its length
         key=None if options.key is None else key_of(options.key.read_bytes(), password),
         message=None if options.message is None else options.message.read_bytes(),
         uid=None if options.uid is None else uid_bytes(options.uid),

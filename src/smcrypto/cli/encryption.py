@@ -126,7 +126,7 @@ def run_decrypt(options: argparse.Namespace) -> int:
         first = next(pieces, b"")  # CHUNK bytes, or all there is
         magic, salt, rest = first[:8], first[8:16], first[16:]
         if magic != MAGIC or len(salt) != SALT_SIZE:
-            raise InvalidCiphertext("not encrypted under a password: the file does not begin with 'Salted__'")
+            raise InvalidCiphertext("not encrypted under a password: the file has no 'Salted__' and salt at its start")
         key, iv = _from_password(passwords.read_password(options, "Password"), salt, options)
         pieces = chain([rest], pieces)
     write_output(options.output, _streamed(_cipher(key, iv, options).decryptor(), pieces))

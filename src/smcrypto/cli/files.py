@@ -93,13 +93,18 @@ def _write_whole(path: Path, pieces: Iterable[bytes], *, mode: int) -> None:
         with path.open("wb") as device:
             device.writelines(pieces)
         return
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    target = path.resolve()  # a link stays: /dev/stdout is one, and may lead to a file
+    try:
+        descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    except OSError as error:
+        error.filename = str(path)
+        raise
     temporary = Path(name)
     try:
         with os.fdopen(descriptor, "wb") as stream:
             stream.writelines(pieces)
         temporary.chmod(mode)
-        temporary.replace(path)
+        temporary.replace(target)
     except BaseException:
         temporary.unlink()
         raise

@@ -9,6 +9,7 @@ from pathlib import Path
 from smcrypto import sm2
 from smcrypto.cli import passwords
 from smcrypto.cli.files import add_output, require_absent, write_output, write_private
+from smcrypto.errors import InvalidOption
 
 __all__ = ["add_key", "add_parser", "add_prf", "add_public", "add_uid", "load_private", "load_public", "uid_bytes"]
 
@@ -77,6 +78,8 @@ def load_public(path: Path) -> sm2.PublicKey:
 
 def run_keygen(options: argparse.Namespace) -> int:
     require_absent(options.output, force=options.force)  # before a password is asked for
+    if options.output == options.public:
+        raise InvalidOption("-o and --public name the same file")
     wanted = options.encrypt or passwords.named(options)
     password = passwords.read_password(options, "New password", confirm=True) if wanted else None
     key = sm2.PrivateKey.generate()

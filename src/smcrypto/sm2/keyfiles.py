@@ -52,7 +52,7 @@ MAX_ITERATIONS: Final = 10_000_000
 MAX_PURE_ITERATIONS: Final = 1_000_000
 """The most where they are of SM3 and `sm3.ENGINE` is "python", 0.11 ms each: two minutes."""
 MAX_SCRYPT_MEMORY: Final = 256 << 20
-"""The most memory, 128 * N * r bytes, that scrypt may ask for."""
+"""The most memory, 128 * N * r bytes and 128 * p * r beside them, that scrypt may ask for."""
 MAX_SCRYPT_BLOCKS: Final = 1 << 23
 """The most work, N * r * p blocks, that scrypt may ask for."""
 
@@ -398,10 +398,10 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
     _read_key_length(parameters, key_length)
     if N < 2 or N & (N - 1) or r < 1 or p < 1:
         raise InvalidEncoding("scrypt's N must be a power of two above 1, its r and p positive")
-    if 128 * N * r > MAX_SCRYPT_MEMORY or N * r * p > MAX_SCRYPT_BLOCKS:
+    if 128 * max(N, p) * r > MAX_SCRYPT_MEMORY or N * r * p > MAX_SCRYPT_BLOCKS:
         raise InvalidKey(
             f"the key file asks for scrypt with N*r = {N * r}, p = {p}; the limits are {MAX_SCRYPT_MEMORY} bytes"
-            f" of memory (128*N*r) and N*r*p = {MAX_SCRYPT_BLOCKS}"
+            f" of memory (128*N*r, 128*p*r) and N*r*p = {MAX_SCRYPT_BLOCKS}"
         )
     if not hasattr(hashlib, "scrypt"):
         raise MissingDependency("the private key is encrypted under scrypt; reading it needs a Python with OpenSSL")

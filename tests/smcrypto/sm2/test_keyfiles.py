@@ -491,6 +491,8 @@ WRONG_ENCRYPTED = {
     "scrypt r = 0": (encrypted(derivation=scrypt(16, 0, 1)), "r and p positive"),
     "scrypt p = 0": (encrypted(derivation=scrypt(16, 1, 0)), "r and p positive"),
     "scrypt beyond 256 MiB": (encrypted(derivation=scrypt(2**19, 8, 1)), "268435456 bytes"),
+    "scrypt beyond 256 MiB by p": (encrypted(derivation=scrypt(2, 1, 2**22)), "268435456 bytes"),
+    "scrypt beyond 256 MiB by p and r": (encrypted(derivation=scrypt(2, 2**20, 4)), "268435456 bytes"),
     "scrypt with too much work": (encrypted(derivation=scrypt(2**14, 8, 65)), "8388608"),
     "scrypt with a key length that does not fit": (encrypted(derivation=scrypt(16, 1, 1, 32)), "a key of 32 bytes"),
     "an empty ciphertext": (encrypted(ciphertext=b""), "the password is wrong"),
