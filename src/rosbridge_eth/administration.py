@@ -222,7 +222,8 @@ def deploy_contract(
 ) -> Deployment:
     """Create the contract and write down where it is; ConfigError where one is written down already.
 
-    where: a node's URL or a provider. wait: seconds for a node to answer and for ETH on the operator's account.
+    where: a node's URL or a provider. wait: seconds for a node to answer and for ETH on the operator's account. One
+    that an attempt before this one created, and could not write down, is found.
     """
     if home.deployment_file.exists():
         raise ConfigError(
@@ -232,7 +233,9 @@ def deploy_contract(
     last = clock() + wait
     while True:
         try:
-            ledger, receipt = Ledger.deploy(where, keys.operator)
+            ledger = Ledger.created_by(where, keys.operator.address) or Ledger.deploy(where, keys.operator)[0]
+            genesis = "0x" + ledger.genesis.hex()
+            made = Deployment(ledger.chain_id, genesis, ledger.contract, ledger.block_number())
             break
         except (ChainUnavailable, OutOfFunds) as error:
             if clock() < last:
@@ -244,7 +247,6 @@ def deploy_contract(
                 ) from error
             else:
                 raise
-    made = Deployment(ledger.chain_id, "0x" + ledger.genesis.hex(), ledger.contract, receipt.block)
     home.save_deployment(made)
     url = urlsplit(load_server_config(home.config).chain.url)
     # Of the operator's node only scheme, host and port: what else stands in a URL is often a key.
@@ -364,6 +366,12 @@ def register_robot(
                     if standing.revoked else
                     f"the contract knows a robot {name!r} that the registry does not; give --replace to take it over"
                 )
+        if request is None:
+            identity = ids.enrol(ca, Role.ROBOT, name, at=now)
+            peer, files = identity.public, ids.identity_files(identity, [ca.certificate], password)
+        else:
+            peer = ids.enrol_requests(ca, Role.ROBOT, name, request.signing, request.encryption, at=now)
+            files = ids.certificate_files(peer, [ca.certificate])
         buried = 0
         if standing.account is not None:
             registry.revoke(Role.ROBOT, name, now)
@@ -376,12 +384,6 @@ def register_robot(
                 )
             if compromised or standing.revoked:
                 buried = _bury(inbox, ledger, tk, f"{name} was replaced")
-        if request is None:
-            identity = ids.enrol(ca, Role.ROBOT, name, at=now)
-            peer, files = identity.public, ids.identity_files(identity, [ca.certificate], password)
-        else:
-            peer = ids.enrol_requests(ca, Role.ROBOT, name, request.signing, request.encryption, at=now)
-            files = ids.certificate_files(peer, [ca.certificate])
         number, account, block = _register(registry, ledger, keys, tk, peer.certificates, standing)
         registry.enrol(peer, now, number=number, account=account, replace=replace)
         readers = {reader.name: reader.certificates.decode() for reader in registry.readers()}
@@ -425,10 +427,10 @@ def _waiting(inbox: Callable[[], Inbox], tk: bytes, patience: float, pause: Call
     handed over is confirmed; how many chunks are not by then."""
     pause(HANDING_OVER)
     with closing(inbox()) as store:
-        while (waiting := store.totals().get(tk)) is not None and waiting.chunks and patience > 0:
+        while (left := store.waiting(tk, store.state(tk).position).chunks) and patience > 0:
             pause(0.2)
             patience -= 0.2
-    return 0 if waiting is None else waiting.chunks
+    return left
 
 
 def _bury(inbox: Callable[[], Inbox], ledger: Ledger, tk: bytes, why: str) -> int:
@@ -455,7 +457,8 @@ def revoke(
     """Take a name out of force: the server closes its session at once, the contract ends its right to write.
 
     The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
-    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters.
+    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters, and what a
+    worker with a slow disk took later when it is run again.
     ChainError: half done; it is run again when the node answers.
     """
     with Registry(home.registry) as registry:
@@ -472,13 +475,15 @@ def revoke(
     try:
         ledger.check()
         [standing] = ledger.standings([tk])
-        if standing.account is None or standing.revoked:
-            if not in_force:
-                raise IdentityError(nobody)
-            return Revoked(None)
-        _waiting(inbox, tk, 0.0 if compromised else LAST_WRITES, pause)
+        ended = standing.account is None or standing.revoked
+        if ended and not known:
+            raise IdentityError(nobody)
+        if in_force or not ended:
+            _waiting(inbox, tk, 0.0 if compromised or ended else LAST_WRITES, pause)
         buried = _bury(inbox, ledger, tk, f"{name} was revoked")
-        return Revoked(ledger.revoke_robot(keys.operator, tk).block, buried)
+        if ended and not in_force and not buried:
+            raise IdentityError(nobody)
+        return Revoked(None if ended else ledger.revoke_robot(keys.operator, tk).block, buried)
     except ChainError as error:
         raise ChainError(
             f"half done: the server takes nothing from {name} any more, but the contract does not know it yet"

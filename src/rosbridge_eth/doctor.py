@@ -306,8 +306,8 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
         inbox.check()
         names, held = opened.names(), inbox.totals()
         yield ok("store", f"{sum(waiting.chunks for waiting in held.values())} chunks wait")
-        for tk in held:
-            if hold := inbox.state(tk).hold:
+        for tk, waiting in held.items():
+            if waiting.chunks and (hold := inbox.state(tk).hold):
                 yield note("on hold", f"{names.get(tk, tk.hex())}: {hold}", "docs/operations.md, On hold")
         if dead := inbox.dead(DEAD):
             yield note("dead letters", f"{len(dead)}, the last: {dead[0].why}", "docs/operations.md, Dead letters")

@@ -77,7 +77,7 @@ def ledger_of(chain_id: int, genesis: str, contract: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Deployment:
-    """A contract on a chain; `block` holds its creation. The first block's hash and the address are 0x-hex."""
+    """A contract on a chain, which has it in `block`. The first block's hash and the address are 0x-hex."""
 
     chain_id: int
     genesis: str

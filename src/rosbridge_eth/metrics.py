@@ -35,6 +35,7 @@ from rosbridge_eth.ledger.contract import WEI_PER_ETH
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger.submitter import Submitter
+    from rosbridge_eth.registry import Enrolment
     from rosbridge_eth.robot import Robot
     from rosbridge_eth.server import Worker
 
@@ -303,17 +304,19 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
     CONDITION.labels(f"{process} archives bodies").set(reception.archive_trouble.why is None)
 
 
-def show_submitter(submitter: Submitter, inbox: Inbox, names: Mapping[bytes, str], folder: Path, wall: float) -> None:
+def show_submitter(
+    submitter: Submitter, inbox: Inbox, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+) -> None:  # fmt: skip
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     process = "submitter"
     beat(process, wall)
-    states = inbox.states([*names])
-    for tk, name in names.items():
-        held = inbox.waiting(tk, states[tk].position)
+    states = inbox.states([*robots])
+    for tk, robot in robots.items():
+        name, held = robot.name, inbox.waiting(tk, states[tk].position)
         WAITING.labels(name).set(held.chunks)
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
-        HELD.labels(name).set(states[tk].hold is not None)
+        HELD.labels(name).set(states[tk].hold is not None and (held.chunks > 0 or robot.revoked_at is None))
         GAS.labels(name).set(submitter.gas[tk])
         if standing := submitter.standings.get(tk):
             ON_CHAIN.labels(name).set(standing.chunks)

@@ -219,7 +219,8 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
         for tk, waiting in inbox.totals().items():
             robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
             oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
-            robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": inbox.state(tk).hold}
+            hold = inbox.state(tk).hold if waiting.chunks or robot["in_force"] else None
+            robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
         reasons = Counter((letter.tk, letter.why) for letter in inbox.dead(DEAD))
     report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
                       for (tk, why), count in reasons.items()]  # fmt: skip

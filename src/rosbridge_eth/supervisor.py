@@ -156,8 +156,8 @@ class Supervisor:
         it is started. on_ready: called with the address that is listened on; on_look: after every look at them.
         """
         self._check(self._config)
+        sockets = server_sockets(self._config.listen, self._config.workers)  # a second server gets no further
         with metrics.shared(self._home.path):
-            sockets = server_sockets(self._config.listen, self._config.workers)
             tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
             for number, sock in enumerate(sockets):
                 tasks[worker_name(number)] = partial(self._work, number, sock)
@@ -285,20 +285,21 @@ class Supervisor:
         submitter = open_submitter(self._config, ledger, inbox, registry, self._secrets.keys)
         subjects = {"trouble": "the node", "unconfirmed": "confirmation", "funds": "the treasury"}
         troubles = {name: Trouble(log, subject) for name, subject in subjects.items()}
-        store, stopped, beats = Trouble(log, "the store"), threading.Event(), Beats()
+        store, beats, due = Trouble(log, "the store"), Beats(), 0.0
         while not asked():
-            registry.revision()  # StoreError where it was exchanged: this process ends, the next one opens it anew
-            wait = FIRST_PAUSE
+            robots = registry.robots()  # StoreError where it was exchanged: the next process opens it anew
             try:
-                wait = submitter.turn(time.time())
-                for name, trouble in troubles.items():
-                    trouble.now(getattr(submitter, name))
+                if time.monotonic() >= due:
+                    due = submitter.turn(time.time()) + time.monotonic()
+                    for name, trouble in troubles.items():
+                        trouble.now(getattr(submitter, name))
                 if beats.due():
-                    metrics.show_submitter(submitter, inbox, registry.names(), self._home.path, time.time())
+                    metrics.show_submitter(submitter, inbox, robots, self._home.path, time.time())
                 store.now(None)
             except StoreError as error:
                 store.now(str(error))
-            stopped.wait(min(wait, FIRST_PAUSE))
+                due = time.monotonic() + FIRST_PAUSE
+            time.sleep(max(0.0, min(due - time.monotonic(), FIRST_PAUSE)))
 
     def _watch(self, web: metrics.Web) -> None:
         web.start()

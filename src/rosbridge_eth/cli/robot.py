@@ -168,8 +168,8 @@ def robot(
     password = read_passphrase("robot", f"Password of {end.robot}", file=password_file)
     again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
+        running = open_robot(place, settings, password)  # a second robot gets no further: the spool is in use
         stack.enter_context(metrics.shared(home))
-        running = open_robot(place, settings, password)
         _asked_for(place, running.box.triggers)  # when nobody was there to take it
 
         def on_signal(number: int, frame: FrameType | None) -> None:

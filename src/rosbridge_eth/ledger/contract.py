@@ -179,6 +179,20 @@ class Ledger:
         return Ledger(where, place.contract, place, timeout=timeout)
 
     @staticmethod
+    def created_by(where: Any, account: str) -> Ledger | None:
+        """The contract that the account's last transaction created, if that is what it did: account and nonce name it.
+
+        ChainUnavailable while one of its transactions is in no block: that may be it.
+        """
+        from web3.utils import get_create_address
+
+        [(count, pending)] = Ledger(where, "0x" + "00" * 20).nonces([account])
+        if pending > count:
+            raise transport.ChainUnavailable(f"a transaction of {account} is in no block yet; deploy when it is")
+        found = Ledger(where, get_create_address(account, max(0, count - 1)))  # type: ignore[arg-type]
+        return found if found.code.hex() == artifact()["deployedBytecode"] else None
+
+    @staticmethod
     def deploy(where: Any, operator: LocalAccount, *, wait: float = 120.0) -> tuple[Ledger, Receipt]:
         """Create the contract; `operator` pays and becomes its operator. Waits until a block holds it."""
         nowhere = Ledger(where, "0x" + "00" * 20)

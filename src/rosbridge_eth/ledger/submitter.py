@@ -158,7 +158,7 @@ class Submitter:
                 self.operator_balance = self._ledger.balance(self._operator.address) if self._operator else None
                 self._cleaned_at = now
         except ChainError as error:
-            self.trouble, self.head = str(error), None
+            self.trouble, self._looked_at = str(error), float("-inf")
             self._pause = min(2 * self._pause, LONGEST_PAUSE)
             return self._pause
         self._pause = IDLE

@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,8 +23,9 @@ from rosbridge_eth.config import Address, load_reader_config, load_server_config
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
-from rosbridge_eth.ledger import Keyring
+from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.ledger.transport import ChainUnavailable
 from rosbridge_eth.registry import Registry
 from smcrypto import x509
 
@@ -262,6 +264,35 @@ def test_an_account_without_eth_is_named_and_may_be_waited_for(tmp_path: Path) -
     assert len(seconds) == 3 and home.deployment()
 
 
+@pytest.mark.parametrize("gone", ["receipt", "genesis"])
+def test_a_contract_whose_receipt_was_not_had_is_found_again(
+    tmp_path: Path, gone: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second one would cost as much again, and nobody would know of the first."""
+    home, seconds = OperatorHome(tmp_path / "home"), []
+    keys = admin.init_home(home, PASSPHRASE, reader=ReaderHome(tmp_path / "r"), reader_passphrase=b"r", now=NOW)
+    chain = EmbeddedChain({keys.operator.address: 10**21})
+
+    def away(*_: object) -> None:
+        raise ChainUnavailable("the node does not answer")
+
+    def back(length: float) -> None:
+        seconds.append(length)
+        patched.undo()
+
+    with monkeypatch.context() as patched, pytest.raises(ChainUnavailable):
+        patched.setattr(Ledger, gone, property(away) if gone == "genesis" else away)
+        admin.deploy_contract(home, chain, keys)
+    assert not home.deployment_file.exists()
+    with monkeypatch.context() as patched:
+        patched.setattr(Ledger, "code", property(away))
+        made = admin.deploy_contract(home, chain, keys, wait=10, clock=lambda: sum(seconds), pause=back)
+    ledger = Ledger.connect(chain, made)
+    ledger.check()
+    assert ledger.nonces([keys.operator.address]) == [(1, 1)] and len(seconds) == 1
+    assert ledger.operator() == keys.operator.address and made.block == ledger.block_number()
+
+
 def test_a_readers_configuration_is_complete_and_tells_no_key_of_the_operators_node(tmp_path: Path) -> None:
     home, reader = OperatorHome(tmp_path / "home"), ReaderHome(tmp_path / "r")
     keys = admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=READER_PASSPHRASE, now=NOW,
@@ -469,6 +500,26 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
         world.revoke()
     with pytest.raises(IdentityError, match="no robot 'robot_2' is enrolled"):
         world.revoke("robot_2")
+
+
+def test_what_came_after_a_revocation_is_buried_by_revoking_again(world: World) -> None:
+    """A worker whose disk was slow may take a chunk when `revoke` has looked: docs/operations.md, On hold."""
+    world.register()
+    assert world.revoke().buried == 0
+    world.hand_over(3)
+    assert world.revoke() == admin.Revoked(None, 3)
+    assert len(world.inbox.dead()) == 3 and world.inbox.totals()[TK].chunks == 0
+    with pytest.raises(IdentityError, match="'robot_1' was revoked already"):
+        world.revoke()
+
+
+def test_a_request_that_cannot_be_certified_does_not_end_the_robot_that_is_in_force(world: World) -> None:
+    world.register()
+    request = world.request()
+    with pytest.raises(IdentityError, match="two keys"):
+        world.register(replace=True, request=replace(request, encryption=request.signing))
+    with registry(world) as known:
+        assert known.find("robot", "robot_1") is not None
 
 
 def test_an_old_backup_of_the_registry_does_not_stop_registrations(world: World, tmp_path: Path) -> None:

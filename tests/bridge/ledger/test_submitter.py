@@ -232,10 +232,12 @@ def test_an_answer_that_is_lost_is_not_needed(world: World):
 
 
 def test_a_node_that_is_away_is_asked_less_and_less_often(world: World):
-    world.model.down = True
+    world.turn()
+    head, world.model.down = world.submitter.head, True
     pauses = [world.turn() for _ in range(8)]
     assert pauses == sorted(pauses)
     assert pauses[-1] == 30
+    assert head is not None and world.submitter.head == head  # whose age tells how long
     world.model.down = False
     world.take(world.pen.chunks(1))
     world.run()

@@ -7,6 +7,7 @@ import json
 import re
 import time
 from collections.abc import Callable
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,17 +18,18 @@ from bridge.chunks import chain as chunk_chain
 from bridge.chunks import dropped
 from bridge.operations.conftest import NODE_SECRETS, PASSWORD, Place
 from bridge.redis_server import RedisServer
-from rosbridge_eth import metrics
+from rosbridge_eth import doctor, metrics
 from rosbridge_eth import status as module
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.cli import run
-from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.errors import BridgeError, ExitCode
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot import open_robot
 from rosbridge_eth.status import Located, locate, span
+from rosbridge_eth.supervisor import open_submitter
 
 TK = robot_id("robot_1")
 STREAM = b"s" * 16
@@ -80,6 +82,26 @@ def test_with_node_and_server_away_the_rest_is_shown_and_what_is_not_known_is_sa
     assert not any(secret in shown.out + shown.err + json.dumps(report) for secret in NODE_SECRETS)
     assert [path for path in sorted(place.path.rglob("*")) if path.suffix != ".sqlite-shm"] == [
         path for path in before if path.suffix != ".sqlite-shm"], "nothing is made"  # fmt: skip
+
+
+def test_a_revoked_robot_is_no_alarm_unless_some_of_its_chunks_wait(
+    place: Place, on_chain: None, keys: Keyring, capsys: Capture
+):
+    with Registry(place.operator.registry) as registry, closing(place.inbox()) as inbox:
+        submitter = open_submitter(load_server_config(place.operator.config), place.ledger, inbox, registry, keys)
+        registry.revoke("robot", "robot_1", datetime.now(UTC))
+        place.ledger.revoke_robot(keys.operator, TK)
+
+        def alarms(now: float) -> tuple[list[str], float]:
+            submitter.turn(now)
+            metrics.show_submitter(submitter, inbox, registry.robots(), place.operator.path, now)
+            return status(capsys)["alarms"], metrics.HELD.labels("robot_1")._value.get()
+
+        now = time.time()
+        assert alarms(now) == ([], 0)
+        assert [finding.what for finding in doctor.store(place.operator, None)] == ["store"]
+        inbox.append([(TK, chunk) for chunk in chunk_chain(1)], now)
+        assert alarms(now + 1) == (["ALARM: robot_1 is on hold: it is revoked."], 1)
 
 
 def test_accounts_are_on_lines_of_their_own_at_any_width(place: Place, monkeypatch: Patch, capsys: Capture):

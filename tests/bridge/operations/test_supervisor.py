@@ -8,15 +8,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import rosbridge_eth
 from bridge.operations.conftest import Place
-from rosbridge_eth.config import load_server_config
-from rosbridge_eth.errors import ExitCode, ProcessError
+from rosbridge_eth import metrics, supervisor
+from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.chunk import Log, robot_id
+from rosbridge_eth.cli import run
+from rosbridge_eth.config import Address, load_server_config
+from rosbridge_eth.errors import ExitCode, NetworkError, ProcessError, StoreError
+from rosbridge_eth.spool import Spool
 from rosbridge_eth.supervisor import (
     GIVE_UP_AFTER,
     LONGEST_PAUSE,
@@ -73,6 +80,57 @@ def test_what_others_are_to_blame_for_and_what_is_not_vital_is_tried_for_ever(pa
     given = [pause(name, code, 0.1) for _ in range(100)]
     assert given[-1] == max(given) == LONGEST_PAUSE
     assert {ExitCode.CHAIN, ExitCode.STORE} == PATIENT
+
+
+def test_who_starts_a_second_one_by_mistake_leaves_the_first_its_figures(
+    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Without them the first would count as dead, and its next child find no folder to count in."""
+    secrets: Any = None
+    monkeypatch.setattr(Supervisor, "_check", lambda *_: None)
+    with metrics.shared(place.operator.path), closing(server_sockets(Address("127.0.0.1", 0))[0]) as door:
+        metrics.beat("submitter", 1.0)
+        place.configure('listen = "127.0.0.1:0"', f'listen = "127.0.0.1:{door.getsockname()[1]}"')
+        with pytest.raises(NetworkError, match="in use"):
+            Supervisor(place.operator, load_server_config(place.operator.config), secrets).run()
+        assert metrics.figures(place.operator.path) == [("beat_seconds", {"process": "submitter"}, 1.0)]
+    place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
+    log = Log(place.robot.bridge().ledger, robot_id("robot_1"))
+    with metrics.shared(place.robot.path), closing(
+        Spool(place.robot.spool, log, max_bytes=2**20, drop=lambda chunk: chunk)
+    ):
+        metrics.beat("robot", 1.0)
+        assert run(["robot", "--password-file", "word"]) == ExitCode.STORE
+        assert "in use" in capsys.readouterr().err
+        assert metrics.figures(place.robot.path) == [("beat_seconds", {"process": "robot"}, 1.0)]
+
+
+def test_the_submitter_asks_as_seldom_as_it_says_and_is_seen_meanwhile(place: Place, monkeypatch: pytest.MonkeyPatch):
+    secrets, clock, turns, seen = SimpleNamespace(keys=None), [100.0], list[float](), list[float]()
+
+    def sleep(seconds: float) -> None:
+        clock[0] += seconds
+        if clock[0] >= 150:
+            raise KeyboardInterrupt
+
+    def turn(now: float) -> float:
+        turns.append(now)
+        if now == 110:
+            raise StoreError("away")
+        return 10.0 if now < 120 else 30.0
+
+    submitter = SimpleNamespace(turn=turn, trouble=None, unconfirmed=None, funds=None)
+    patched = SimpleNamespace(monotonic=lambda: clock[0], time=lambda: clock[0], sleep=sleep)
+    monkeypatch.setattr(supervisor, "time", patched)
+    monkeypatch.setattr(supervisor, "open_submitter", lambda *_: submitter)
+    monkeypatch.setattr(metrics, "show_submitter", lambda *given: seen.append(given[-1]))
+    server: Any = Supervisor(place.operator, load_server_config(place.operator.config), secrets)  # type: ignore[arg-type]
+    server._pid, handler = os.getppid(), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt):
+        server._submit()
+    signal.signal(signal.SIGTERM, handler)
+    assert turns == [100, 110, 111, 121]
+    assert seen == [float(second) for second in range(100, 150) if second != 110]
 
 
 def test_workers_are_named_by_their_numbers():
