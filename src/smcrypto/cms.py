@@ -127,10 +127,13 @@ def verify(
         held = wrapped.octet_string()
         wrapped.finish()
     inside.finish()
-    if (held is None) == (content is None):
-        raise InvalidEncoding("the content is missing" if held is None else "the content is inside and given as well")
-    trust = _Trust.of(roots, at, intermediates, crls, uid)
-    return _verified(body, held if held is not None else as_bytes(content or b"", "content"), trust)
+    if content is not None:
+        if held is not None:
+            raise InvalidEncoding("the content is inside and given as well")
+        held = as_bytes(content, "content")
+    if held is None:
+        raise InvalidEncoding("the content is missing")
+    return _verified(body, held, _Trust.of(roots, at, intermediates, crls, uid))
 
 
 class _Trust(NamedTuple):

@@ -4,15 +4,16 @@ What is written: certificates and keys encrypted by SM4-CBC under PBKDF2, the wh
 derivation of RFC 7292, B.2. What is read: everything that key files may be encrypted with (see `sm2.keyfiles`), and
 the MAC with SM3, SHA-1 or SHA-2. `openssl pkcs12` reads and writes the same (OpenSSL 3.0 wants `prf="sha256"`).
 
-The MAC comes first: nothing inside is parsed before it holds. Not here: files without a MAC, signed ones, the old
-encryptions by RC2 and 3DES of PKCS#12 itself, secret and revocation list bags.
+The MAC comes first: nothing inside is parsed before it holds. Who makes a file knows its password, so the work that all
+its parts together ask for is bounded. Not here: files without a MAC, signed ones, the old encryptions by RC2 and 3DES
+of PKCS#12 itself, secret and revocation list bags.
 """
 
 from __future__ import annotations
 
 import hashlib
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from hmac import compare_digest
 from hmac import new as hmac_new
 from typing import Final, NamedTuple
@@ -20,7 +21,7 @@ from typing import Final, NamedTuple
 from smcrypto import der, sm2, sm3
 from smcrypto.errors import InvalidEncoding, InvalidKey, InvalidOption, InvalidPadding
 from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
-from smcrypto.sm2.keyfiles import ITERATIONS, MAX_PURE_ITERATIONS, Prf, read_pbes2, write_pbes2
+from smcrypto.sm2.keyfiles import ITERATIONS, MAX_ITERATIONS, MAX_PURE_ITERATIONS, Prf, read_pbes2, write_pbes2
 from smcrypto.x509 import Certificate
 
 __all__ = ["Contents", "Entry", "dump", "load"]
@@ -38,6 +39,7 @@ _SM3: Final = "1.2.156.10197.1.401"
 _HASHES: Final = {
     _SM3: ("sm3", 64),
     "1.3.14.3.2.26": ("sha1", 64),
+    "2.16.840.1.101.3.4.2.4": ("sha224", 64),
     "2.16.840.1.101.3.4.2.1": ("sha256", 64),
     "2.16.840.1.101.3.4.2.2": ("sha384", 128),
     "2.16.840.1.101.3.4.2.3": ("sha512", 128),
@@ -73,8 +75,8 @@ def dump(
 
     entries: keys with certificates; two for the signing and the encryption pair of TLCP. others: the chain.
     password: UTF-8, not empty. prf: of PBKDF2, "sm3", or "sha256" for OpenSSL 3.0. iterations: of PBKDF2 and of the
-    MAC. InvalidOption: a password that is empty or not UTF-8, no entry, an unknown prf, iterations out of range.
-    InvalidKey: a certificate that is not of the key beside it.
+    MAC. InvalidOption: a password that is empty or not UTF-8, no entry, an unknown prf, iterations out of range
+    (1,000,000; 10,000,000 for all keys together). InvalidKey: a certificate that is not of the key beside it.
 
     >>> key = sm2.PrivateKey.generate()
     >>> load(dump([Entry(key, name="robot")], b"password", iterations=1000), b"password").entries[0].name
@@ -85,6 +87,8 @@ def dump(
         raise InvalidOption("there is no key to write")
     if not 1 <= require_int(iterations, "iterations") <= MAX_PURE_ITERATIONS:
         raise InvalidOption(f"iterations must be between 1 and {MAX_PURE_ITERATIONS}, not {iterations}")
+    if iterations * (len(listed) + 1) > MAX_ITERATIONS:
+        raise InvalidOption(f"{iterations} iterations for each of {len(listed)} keys are too many for `load`")
     try:
         wide = _bmp(secret)
     except UnicodeDecodeError:
@@ -126,28 +130,34 @@ def dump(
 def load(data: BytesLike, password: BytesLike) -> Contents:
     """What a PKCS#12 file in DER holds.
 
-    InvalidKey: not such a file, the wrong password, an encryption that is not supported, a key that is not SM2's.
+    InvalidKey: not such a file, the wrong password, an encryption that is not supported, more work than 10,000,000
+    iterations in all, a key that is not SM2's. MissingDependency: its cipher needs a package.
     CertificateError: a certificate in it that is not well formed, or not with an SM2 key.
     """
     octets, secret = as_bytes(data, "data"), as_bytes(password, "password")
+    certificates: list[Certificate] = []
+    keys: list[tuple[sm2.PrivateKey, str | None]] = []
     try:
-        safe = _authenticated(octets, secret)
-        bags: list[_Bag] = []
-        contents = der.only_sequence(safe)
-        while not contents.at_end():
-            bags += _read_content(contents.sequence(), secret)
+        contents = [_read_content(content) for content in _members(_authenticated(octets, secret))]
+        _require_bounded(contents)
+        bags = [_read_bag(bag) for content in contents for bag in _members(content.opened(secret))]
+        _require_bounded([*contents, *(bag.value for bag in bags)])
+        for bag in bags:
+            value = bag.value.opened(secret)
+            if bag.kind == _CERT_BAG:
+                certificates.append(Certificate.from_der(value))
+            else:
+                keys.append((sm2.PrivateKey.from_der(value), bag.name))
     except InvalidPadding:
         raise InvalidKey(_WRONG) from None
     except InvalidEncoding as error:
         raise InvalidKey(f"not a PKCS#12 file: {error}") from None
-    certificates = [bag.value for bag in bags if isinstance(bag.value, Certificate)]
     entries: list[Entry] = []
-    for bag in bags:
-        if isinstance(bag.value, sm2.PrivateKey):
-            own = next((c for c in certificates if c.public_key == bag.value.public_key), None)
-            if own is not None:
-                certificates.remove(own)
-            entries.append(Entry(bag.value, own, bag.name))
+    for key, name in keys:
+        own = next((c for c in certificates if c.public_key == key.public_key), None)
+        if own is not None:
+            certificates.remove(own)
+        entries.append(Entry(key, own, name))
     return Contents(tuple(entries), tuple(certificates))
 
 
@@ -226,18 +236,42 @@ def _derive(digest: Callable[[bytes], bytes], v: int, P: bytes, S: bytes, r: int
 # --- reading what is inside ---
 
 
+class _Value(NamedTuple):
+    """Bytes of the file; what makes plaintext of them, where they are encrypted, and its work in iterations."""
+
+    octets: bytes
+    decrypt: Callable[[bytes, bytes], bytes] | None = None
+    work: int = 0
+
+    def opened(self, password: bytes) -> bytes:
+        return self.octets if self.decrypt is None else self.decrypt(password, self.octets)
+
+
 class _Bag(NamedTuple):
-    value: sm2.PrivateKey | Certificate
+    kind: str
+    value: _Value
     name: str | None
 
 
-def _read_content(content: der.Reader, password: bytes) -> list[_Bag]:
+def _members(data: bytes) -> Iterator[der.Reader]:
+    """The sequences in a SEQUENCE OF."""
+    outer = der.only_sequence(data)
+    while not outer.at_end():
+        yield outer.sequence()
+
+
+def _require_bounded(values: Iterable[_Value]) -> None:
+    if (work := sum(value.work for value in values)) > MAX_ITERATIONS:
+        raise InvalidKey(f"the file asks for {work} iterations in all; the limit is {MAX_ITERATIONS}")
+
+
+def _read_content(content: der.Reader) -> _Value:
     """One ContentInfo of the AuthenticatedSafe: SafeContents, plain or encrypted."""
     name = content.oid()
     wrapped = content.explicit(0)
     content.finish()
     if name == _DATA:
-        octets = wrapped.octet_string()
+        value = _Value(wrapped.octet_string())
     elif name == _ENCRYPTED_DATA:
         encrypted = wrapped.sequence()
         if encrypted.integer() != 0:
@@ -246,21 +280,16 @@ def _read_content(content: der.Reader, password: bytes) -> list[_Bag]:
         encrypted.finish()
         if info.oid() != _DATA:
             raise InvalidEncoding("what is encrypted is not data")
-        decrypt = read_pbes2(info.sequence(), "the content")
-        ciphertext = info.implicit(0)
+        decryption = read_pbes2(info.sequence(), "the content")
+        value = _Value(info.implicit(0), *decryption)
         info.finish()
-        octets = decrypt(password, ciphertext)
     else:
         raise InvalidEncoding(f"contents of the kind {name}")
     wrapped.finish()
-    bags: list[_Bag] = []
-    safe = der.only_sequence(octets)
-    while not safe.at_end():
-        bags.append(_read_bag(safe.sequence(), password))
-    return bags
+    return value
 
 
-def _read_bag(bag: der.Reader, password: bytes) -> _Bag:
+def _read_bag(bag: der.Reader) -> _Bag:
     kind = bag.oid()
     wrapped = bag.explicit(0)
     value = wrapped.raw()
@@ -273,12 +302,17 @@ def _read_bag(bag: der.Reader, password: bytes) -> _Bag:
             raise InvalidEncoding("a certificate that is not X.509")
         inner = members.explicit(0)
         members.finish()
-        certificate = Certificate.from_der(inner.octet_string())
+        value = inner.octet_string()
         inner.finish()
-        return _Bag(certificate, name)
-    if kind not in (_KEY_BAG, _SHROUDED_KEY_BAG):
+    elif kind == _SHROUDED_KEY_BAG:
+        members = der.only_sequence(value)
+        decryption = read_pbes2(members.sequence(), "the key")
+        sealed = members.octet_string()
+        members.finish()
+        return _Bag(kind, _Value(sealed, *decryption), name)
+    elif kind != _KEY_BAG:
         raise InvalidEncoding(f"a bag of the kind {kind}")
-    return _Bag(sm2.PrivateKey.from_der(value, password if kind == _SHROUDED_KEY_BAG else None), name)
+    return _Bag(kind, _Value(value), name)
 
 
 def _read_name(attributes: der.Reader) -> str | None:

@@ -312,6 +312,8 @@ def test_what_is_missing_or_twice() -> None:
         cms.verify(attached, **TRUST, content=CONTENT)
     with pytest.raises(InvalidEncoding, match="missing"):
         cms.verify(detached, **TRUST)
+    with pytest.raises(TypeError):
+        cms.verify(detached, **TRUST, content="")
     members = parts(attached)
     with pytest.raises(InvalidSignature, match="nobody"):
         cms.verify(message(2, [*members[:-1], der.set_of()]), **TRUST)

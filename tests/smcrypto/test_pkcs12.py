@@ -35,6 +35,7 @@ def openssl(require: Callable[[str], str], *arguments: str | Path, data: bytes =
 @pytest.mark.parametrize("options", [
     ["-keypbe", "sm4-cbc", "-certpbe", "sm4-cbc", "-macalg", "sm3"],
     ["-keypbe", "sm4-cbc", "-certpbe", "NONE", "-macalg", "sha1"],
+    ["-keypbe", "NONE", "-certpbe", "NONE", "-macalg", "sha224"],
     ["-keypbe", "NONE", "-certpbe", "sm4-cbc", "-macalg", "sha512", "-maciter"],
     ["-keypbe", "aes-256-cbc", "-certpbe", "aes-128-cbc", "-macalg", "sha384"],
     ["-keypbe", "sm4-cbc", "-certpbe", "sm4-cbc", "-macalg", "sha256", "-nomaciter"],
@@ -75,6 +76,7 @@ def test_both_pairs_of_an_identity(prf: Any) -> None:
     (lambda: dump([Entry(KEY)], b"\xff"), InvalidOption),
     (lambda: dump([Entry(KEY)], b"p", prf="md5"), InvalidOption),
     (lambda: dump([Entry(KEY)], b"p", iterations=0), InvalidOption),
+    (lambda: dump([Entry(KEY)] * 10, b"p", iterations=1_000_000), InvalidOption),
     (lambda: dump([Entry(KEY, ROOT)], b"p", **FAST), InvalidKey),
     (lambda: dump([KEY], b"p"), TypeError),
     (lambda: dump([Entry(b"")], b"p"), TypeError),
@@ -154,6 +156,24 @@ def test_shapes_that_are_taken() -> None:
 def test_shapes_that_are_refused(data: bytes) -> None:
     with pytest.raises(InvalidKey):
         load(data, b"p")
+
+
+def asks_for(iterations: int) -> bytes:
+    function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
+    derivation = der.sequence(der.oid("1.2.840.113549.1.5.12"),
+                              der.sequence(der.octet_string(b"salt"), der.integer(iterations), function))
+    cipher = der.sequence(der.oid("1.2.156.10197.1.104.2"), der.octet_string(bytes(16)))
+    return der.sequence(der.oid("1.2.840.113549.1.5.13"), der.sequence(derivation, cipher))
+
+
+def test_the_work_of_all_parts_together_is_bounded() -> None:
+    key = bag(BAGS + "2", der.sequence(asks_for(5_000_001), der.octet_string(bytes(32))))
+    with pytest.raises(InvalidKey, match="10000002 iterations in all"):
+        load(pfx(plain(key, key)), b"p")
+    info = der.sequence(der.oid(DATA), asks_for(5_000_001), der.implicit(0, bytes(32)))
+    part = der.sequence(der.oid(ENCRYPTED), der.explicit(0, der.sequence(der.integer(0), info)))
+    with pytest.raises(InvalidKey, match="10000002 iterations in all"):
+        load(pfx(der.sequence(part, part)), b"p")
 
 
 def test_a_certificate_that_is_none_is_named() -> None:

@@ -20,6 +20,7 @@ import hashlib
 import hmac
 import secrets
 from collections.abc import Callable
+from functools import partial
 from typing import Final, Literal
 
 from smcrypto import der, pem
@@ -293,7 +294,7 @@ def _decrypted(data: bytes, password: bytes | None) -> int:
     scheme = info.sequence()
     ciphertext = info.octet_string()
     info.finish()
-    decrypt = read_pbes2(scheme, "the key")
+    decrypt, _ = read_pbes2(scheme, "the key")
     if password is None:
         raise InvalidKey("the private key is encrypted; a password is needed")
     try:
@@ -303,11 +304,12 @@ def _decrypted(data: bytes, password: bytes | None) -> int:
         raise InvalidKey("the password is wrong, or the key file is damaged") from None
 
 
-def read_pbes2(scheme: der.Reader, what: str) -> Callable[[bytes, bytes], bytes]:
-    """The decryption that a PBES2 AlgorithmIdentifier describes, RFC 8018, A.4: of (password, ciphertext).
+def read_pbes2(scheme: der.Reader, what: str) -> tuple[Callable[[bytes, bytes], bytes], int]:
+    """The decryption, of (password, ciphertext), of a PBES2 AlgorithmIdentifier (RFC 8018, A.4), and its work.
 
-    That raises InvalidPadding where the password is wrong, most of the time. InvalidEncoding: an algorithm that is
-    not supported; InvalidKey: one that asks for too much work.
+    The work is PBKDF2's iterations or scrypt's N * r * p, which take about as long. The decryption raises
+    InvalidPadding where the password is wrong, most of the time. InvalidEncoding: an algorithm that is not supported;
+    InvalidKey: one that asks for too much work.
     """
     name = scheme.oid()
     if name != _PBES2:
@@ -325,11 +327,11 @@ def read_pbes2(scheme: der.Reader, what: str) -> Callable[[bytes, bytes], bytes]
     cipher.finish()
     if len(iv) != block:
         raise InvalidEncoding(f"the IV has {len(iv)} bytes, not {block}")
-    derive = _read_derivation(derivation, key_length)
-    return lambda password, ciphertext: _cbc_decrypt(algorithm, derive(password), iv, ciphertext)
+    derive, work = _read_derivation(derivation, key_length)
+    return lambda password, ciphertext: _cbc_decrypt(algorithm, derive(password), iv, ciphertext), work
 
 
-def _read_derivation(algorithm: der.Reader, key_length: int) -> Callable[[bytes], bytes]:
+def _read_derivation(algorithm: der.Reader, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
     name = algorithm.oid()
     if name not in (_PBKDF2, _SCRYPT):
         raise InvalidEncoding(f"the key derivation {name} is not supported")
@@ -337,9 +339,9 @@ def _read_derivation(algorithm: der.Reader, key_length: int) -> Callable[[bytes]
     algorithm.finish()
     salt = parameters.octet_string()
     read = _read_pbkdf2 if name == _PBKDF2 else _read_scrypt
-    derive = read(parameters, salt, key_length)
+    found = read(parameters, salt, key_length)
     parameters.finish()
-    return derive
+    return found
 
 
 def _read_key_length(parameters: der.Reader, key_length: int) -> None:
@@ -347,7 +349,7 @@ def _read_key_length(parameters: der.Reader, key_length: int) -> None:
         raise InvalidEncoding(f"a key of {found} bytes is derived for a cipher that takes {key_length}")
 
 
-def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> Callable[[bytes], bytes]:
+def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
     """PBKDF2-params after the salt, RFC 8018, A.2. The default function, HMAC-SHA-1, is never spelt out in DER."""
     iterations = parameters.integer()
     if not 1 <= iterations <= MAX_ITERATIONS:
@@ -371,8 +373,8 @@ def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
                 f"the key file asks for {iterations} PBKDF2 iterations of SM3; without OpenSSL's SM3 the limit is"
                 f" {MAX_PURE_ITERATIONS}"
             )
-        return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length)
-    return lambda password: _pbkdf2(hash_name, password, salt, iterations, key_length)
+        return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length), iterations
+    return lambda password: _pbkdf2(hash_name, password, salt, iterations, key_length), iterations
 
 
 def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
@@ -392,7 +394,7 @@ def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
     return output[:dkLen]
 
 
-def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callable[[bytes], bytes]:
+def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
     """scrypt-params after the salt, RFC 7914, 7: N, r, p."""
     N, r, p = parameters.integer(), parameters.integer(), parameters.integer()
     _read_key_length(parameters, key_length)
@@ -407,9 +409,7 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> Callab
         raise MissingDependency("the private key is encrypted under scrypt; reading it needs a Python with OpenSSL")
     # OpenSSL counts 32 * (N + p + 2) * 4 * r bytes and small change against maxmem.
     memory = 128 * r * (N + p + 2) + (1 << 16)
-    return lambda password: hashlib.scrypt(
-        password, salt=salt, n=N, r=r, p=p, maxmem=memory, dklen=key_length
-    )
+    return partial(hashlib.scrypt, salt=salt, n=N, r=r, p=p, maxmem=memory, dklen=key_length), N * r * p
 
 
 def _cbc_decrypt(algorithm: str, key: bytes, iv: bytes, ciphertext: bytes) -> bytes:

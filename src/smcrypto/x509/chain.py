@@ -22,14 +22,14 @@ from smcrypto.x509 import extensions as ext
 from smcrypto.x509.certificate import Certificate
 from smcrypto.x509.names import Name
 from smcrypto.x509.revocation import CertificateRevocationList, check_revocation
-from smcrypto.x509.signed import instant
+from smcrypto.x509.signed import Signed, instant
 
 __all__ = ["MAX_PATH", "verify_chain"]
 
 MAX_PATH: Final = 10
 """The most certificates in a path, leaf and root included."""
 _MAX_STEPS: Final = 1000  # candidates looked at in one search
-_MAX_SIGNATURES: Final = 100  # signatures verified in one search
+_MAX_SIGNATURES: Final = 100  # signatures of certificates and revocation lists verified in one search
 
 # Extensions that are processed here or bind nobody but the subject, and so may be critical.
 _PROCESSED: Final = frozenset(
@@ -96,7 +96,7 @@ def _names(names: str | Iterable[str] | None) -> tuple[str, ...]:
     return listed
 
 
-class _GivenUp(CertificateError):
+class _GivenUp(Exception):
     """A limit of the search was reached: no other path is tried."""
 
 
@@ -123,12 +123,15 @@ class _Search:
         self.crls = crls
         self.every = every
         self.steps = 0
-        self.signatures: dict[tuple[Certificate, Certificate], CertificateError | None] = {}
+        self.signatures: dict[tuple[Signed, Certificate], CertificateError | None] = {}
         self.refusal: tuple[float, CertificateError] = (0, CertificateError("no path was found"))
 
     def from_leaf(self, leaf: Certificate) -> tuple[Certificate, ...]:
         self.require_fit(leaf)
-        path = self.extend((leaf,))
+        try:
+            path = self.extend((leaf,))
+        except _GivenUp as error:
+            raise CertificateError(str(error)) from None
         if path is not None:
             return path
         raise self.refusal[1]
@@ -152,8 +155,6 @@ class _Search:
                 self.require_fit(issuer)
                 _require_issuer(issuer, path)
                 self.require_signature(current, issuer)
-            except _GivenUp:
-                raise
             except CertificateError as error:
                 self.refused(path, error)
                 continue
@@ -171,7 +172,7 @@ class _Search:
         """The path, unless a revocation list of one of its issuers speaks against it: 6.3."""
         if self.crls or self.every:
             try:
-                check_revocation(path, self.crls, self.at, self.uid, every=self.every)
+                check_revocation(path, self.crls, self.at, self.require_signature, every=self.every)
             except CertificateError as error:
                 self.refused(path, error)
                 return None
@@ -200,13 +201,14 @@ class _Search:
             missing = ", ".join(sorted(self.purposes - set(allowed)))
             raise CertificateError(f"{certificate.subject} is not for {missing}")
 
-    def require_signature(self, certificate: Certificate, issuer: Certificate) -> None:
-        pair = (certificate, issuer)
+    def require_signature(self, signed: Certificate | CertificateRevocationList, issuer: Certificate) -> None:
+        pair = (signed, issuer)
         if pair not in self.signatures:
             if len(self.signatures) >= _MAX_SIGNATURES:
                 raise _GivenUp(f"no path was found with {_MAX_SIGNATURES} signatures")
+            verify = signed.verify_signature if isinstance(signed, Certificate) else signed.verify
             try:
-                certificate.verify_signature(issuer, uid=self.uid)
+                verify(issuer, uid=self.uid)
                 self.signatures[pair] = None
             except CertificateError as error:
                 self.signatures[pair] = error

@@ -7,7 +7,7 @@ is refused.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
@@ -72,7 +72,7 @@ class CertificateRevocationList(Signed):
         """The CA's list, complete. number: above that of every list before (5.2.3).
 
         InvalidKey: `ca_key` is not the key of `ca_certificate`. InvalidOption:
-        an entry twice, an unknown reason, a negative number, naive or reversed times.
+        an entry twice, an unknown reason, a negative number or serial number, naive or reversed times.
         """
         require_type(ca_certificate, Certificate, "ca_certificate")
         require_type(ca_key, sm2.PrivateKey, "ca_key")
@@ -86,6 +86,8 @@ class CertificateRevocationList(Signed):
         entries = tuple(revoked)
         for entry in entries:
             require_type(entry, RevokedCertificate, "what is revoked")
+            if require_int(entry.serial_number, "serial_number") < 0:
+                raise InvalidOption("a serial number that is revoked must not be negative")
         if len({entry.serial_number for entry in entries}) != len(entries):
             raise InvalidOption("a serial number is revoked twice")
         extensions = [ext.crl_number(number)]
@@ -188,7 +190,7 @@ def check_revocation(
     path: Sequence[Certificate],
     crls: Sequence[CertificateRevocationList],
     at: datetime,
-    uid: bytes,
+    verify: Callable[[CertificateRevocationList, Certificate], None],
     *,
     every: bool,
 ) -> None:
@@ -196,7 +198,8 @@ def check_revocation(
 
     The leaf needs a fresh list of its issuer; with `every` so does each
     certificate below the root, without it a CA is checked where a list of its issuer is given.
-    A listed certificate is refused whatever the date of its revocation.
+    verify: of a list and its issuer, raises CertificateError. A listed certificate is refused whatever the date of its
+    revocation.
     """
     for position, (certificate, issuer) in enumerate(pairwise(path)):
         problem: CertificateError | None = None
@@ -205,8 +208,8 @@ def check_revocation(
             if crl.issuer != certificate.issuer:
                 continue
             try:
-                crl.verify(issuer, uid=uid)
-                crl.require_fresh(at)
+                crl.require_fresh(at)  # first, as it costs nothing
+                verify(crl, issuer)
             except CertificateError as error:
                 problem = error
                 continue

@@ -93,6 +93,7 @@ def test_making_a_list_refuses_what_cannot_be_written() -> None:
         "before this_update": lambda: SUB.crl(next_update=NOW - timedelta(seconds=1)),
         "aware": lambda: SUB.crl(this_update=NOW.replace(tzinfo=None)),
         "number must not be negative": lambda: SUB.crl(number=-1),
+        "is revoked must not be negative": lambda: SUB.crl(RevokedCertificate(-5, NOW)),
     }.items():
         with pytest.raises(InvalidOption, match=reason):
             make()
@@ -281,6 +282,14 @@ def test_an_altered_list_is_refused(position: int, value: int) -> None:
     altered[position] = value
     with pytest.raises(SMCryptoError):
         CertificateRevocationList.from_der(altered).verify(SUB.certificate)
+
+
+def test_many_lists_are_not_all_verified() -> None:
+    forged = [SUB.crl(number=number, uid=b"another") for number in range(101)]
+    stale = [SUB.crl(number=number, next_update=NOW) for number in range(101)]
+    with pytest.raises(CertificateError, match="no path was found with 100 signatures"):
+        verify(GOOD, *forged)
+    assert len(verify(GOOD, *stale, CRL)) == 3
 
 
 # --- openssl ---
