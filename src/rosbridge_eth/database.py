@@ -196,6 +196,8 @@ class Database:
             if code == sqlite3.SQLITE_FULL:
                 raise DiskFull(f"the disk of {where} is full; make room, what was kept before is safe") from None
             raise StoreError(f"{where} cannot be used ({error}); what was kept before is safe") from None
+        except OSError as error:  # of the reserve
+            raise StoreError(f"the disk of the {self._what} {self.path} fails ({error.strerror})") from None
 
     def _damage(self, reason: str, *, move: bool) -> StoreError:
         number = 1

@@ -140,8 +140,8 @@ class Robot:
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
 
-        on_turn: called at every turn of the loop, to show progress. Raises what the source raised, after everything
-        that was captured is delivered.
+        on_turn: called at every turn of the loop, to show progress. Raises what the source raised: of a live one at
+        once, so that it can be started again, of another after everything that was captured is delivered.
         """
         reading = threading.Thread(target=self._read, name="source", daemon=True)
         reading.start()
@@ -191,6 +191,9 @@ class Robot:
             self.source.run(self._emit, self._stop)
         except BaseException as error:  # kept and raised in the thread that waits for this one
             self._source_error = error
+            log.error("the source has ended", exc_info=error)
+            if self.source.live:
+                self._stop.set()
         finally:
             self._source_ended.set()
             self.loop.wake()
@@ -224,7 +227,7 @@ class Robot:
                 break
         if not self._full(2):
             self._room.set()
-        if now - self._losses_at >= LOSSES_EVERY:
+        if now - self._losses_at >= LOSSES_EVERY and len(self._unspooled) < MAX_UNSPOOLED:
             self._losses_at = now
             self._add_losses(now)
 
@@ -315,6 +318,7 @@ class Robot:
             "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
             "records that there was no memory for until their event": self.box.lost.total(),
+            "messages lost, since the spool took nothing": len(self._ring) + len(self.box.released),
             "chunks lost, since the spool took nothing": len(self._unspooled),
             "chunks dropped from the full spool": spool.dropped_bodies,
             "chunks refused by the server": sender.refused,

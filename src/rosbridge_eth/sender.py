@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from rosbridge_eth import protocol
 from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason, Unresolved
 from rosbridge_eth.chunk import MAX_CHUNK
-from rosbridge_eth.errors import NetworkError, StoreError
+from rosbridge_eth.errors import StoreError
 from rosbridge_eth.protocol import MAX_PART, Confirmed, Have, Hold, Offer, Part, ProtocolError, Refused, Stored, Where
 from rosbridge_eth.spool import Spool
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
 AHEAD = 8 * 1024 * 1024  # bytes of chunks beyond what the server has stored; no further one is begun then
-SAY_AGAIN = 60.0  # seconds before the same reason for having no session is said once more
+SAY_AGAIN = 60.0  # seconds before the same reason why nothing is sent is said once more
 
 
 def mend(failure: HandshakeFailed, channel: str) -> str:
@@ -75,7 +75,7 @@ class Sender:
         self._on_server_time = on_server_time
         self.begin_stream: Callable[[bytes], None] = lambda refused: None
         """Called when the server refused a stream, which may be the one that is being written."""
-        self._said: dict[str, float] = {}  # reason for having no session, or for a hold -> when it was said
+        self._said: dict[str, float] = {}  # reason -> when it was said
         self._stream: bytes | None = None  # being sent; None: the next one is to be asked about
         self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
         self._stored: int | None = None  # the newest number of it that the server has
@@ -138,8 +138,7 @@ class Sender:
             self._flying.clear()
 
     def handle(self, event: Event, now: float) -> None:
-        """Take one event of the client. Raises NetworkError where the server says what is no message of ours, and
-        StoreError where the spool cannot note it; then it is asked for again."""
+        """Take one event of the client. StoreError where the spool cannot note it; then it is asked for again."""
         match event:
             case Connected(peer=peer, server_time=server_time):
                 self.statistics.sessions += 1
@@ -147,7 +146,7 @@ class Sender:
                 self.statistics.refusal = None
                 self._stream, self._asked = None, False
                 log.info("connected to %s", peer)
-                if server_time is not None:
+                if server_time is not None and server_time <= peer.not_after:  # else its clock is wrong
                     self._on_server_time(server_time.timestamp())
             case Disconnected(reason=reason):
                 self.statistics.connected, self.statistics.held = False, None
@@ -155,19 +154,23 @@ class Sender:
             case HandshakeFailed(why=why) | Unresolved(why=why):
                 todo = "" if isinstance(event, Unresolved) else f"; {mend(event, self._channel)}"
                 self.statistics.refusal = why + todo
-                if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:  # not at every attempt
-                    self._said[why] = now
-                    log.warning("no session: %s", self.statistics.refusal)
+                self._warn(why, f"no session: {self.statistics.refusal}", now)
             case Message(payload=payload):
                 try:
                     self._take(protocol.decode_down(payload), now)
-                except ProtocolError as error:  # nothing is lost: what is not confirmed is in the spool
-                    raise NetworkError(
-                        f"the server says what is no message here ({error}); use the same version on both ends"
-                    ) from error
+                except ProtocolError as error:
+                    why = "the server says what is no message here; use the same version on both ends"
+                    self.statistics.refusal = why
+                    self._warn(why, f"{why} ({error})", now)
                 except StoreError:  # not noted: ask again, and the server says it again
                     self._stream, self._asked = None, False
                     raise
+
+    def _warn(self, why: str, text: str, now: float) -> None:
+        """At most once a minute for the same reason."""
+        if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:
+            self._said[why] = now
+            log.warning("%s", text)
 
     def _take(self, message: protocol.Down, now: float) -> None:
         match message:
@@ -193,9 +196,7 @@ class Sender:
             case Hold(why=why):
                 self._asked, self.statistics.held = True, why
                 self._client.expecting(False)
-                if now - self._said.get(why, float("-inf")) >= SAY_AGAIN:
-                    self._said[why] = now
-                    log.warning("the server takes nothing at this moment: %s", why)
+                self._warn(why, f"the server takes nothing at this moment: {why}", now)
             case Refused(stream=stream, number=number, why=why):
                 aside = self._spool.set_aside(stream, number)
                 self.statistics.refused += aside

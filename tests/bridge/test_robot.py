@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
@@ -14,12 +15,12 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
-from rosbridge_eth.channel import Client, ClientConfig, HandshakeFailed, Message
+from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
 from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import Address
 from rosbridge_eth.database import DiskFull
-from rosbridge_eth.errors import NetworkError, StoreError
+from rosbridge_eth.errors import NetworkError, SourceError, StoreError
 from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
 from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.sender import Sender
@@ -189,6 +190,16 @@ def test_an_answer_that_the_spool_could_not_note_is_asked_for_again(
         assert robot.spool_trouble.why is None and sender.idle
 
 
+def test_a_time_at_which_the_server_s_own_certificates_do_not_hold_is_not_kept(make: Callable[[int], Robot]) -> None:
+    robot, kept = make(0), list[float]()
+    robot.sender._on_server_time = kept.append
+    hub = ids.enrol(ids.create_ca("operator", at=NOW), ids.Role.SERVER, "hub", at=NOW).public
+    for at in (NOW, hub.not_after + timedelta(seconds=1)):
+        robot.handle(Connected(hub, bytes(8), at))
+    with closing(robot.spool), closing(robot.loop):
+        assert kept == [NOW.timestamp()], "with a later one, no certificate of this server would ever hold again"
+
+
 class Full:
     """The spool's `append`, on a disk that is full as long as `full` says so."""
 
@@ -228,6 +239,27 @@ def test_a_robot_that_is_stopped_tries_the_spool_once_more(
     assert f"{robot.chunks} chunks kept for later" in robot.summary and "lost" not in robot.summary
 
 
+def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_memory(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make(1000)
+    Full(robot, monkeypatch)
+    for name, value in {"LOSSES_EVERY": 0.0, "MAX_UNSPOOLED": 3, "RING": 64}.items():
+        monkeypatch.setattr(f"rosbridge_eth.robot.{name}", value)
+    waiting: list[int] = []
+
+    def on_turn() -> None:
+        robot.source.lost[TOPIC, "dropped"] = len(waiting)  # type: ignore[attr-defined]
+        if len(robot._unspooled) >= 3:
+            waiting.append(len(robot._unspooled))
+        if len(waiting) == 100:
+            robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert waiting[-1] <= 4
+    assert re.search(r"[1-9]\d+ messages lost, since the spool took nothing", robot.summary), "what the ring held"
+
+
 def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,16 +281,26 @@ def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
     assert f"{robot.chunks} chunks kept for later" in robot.summary
 
 
-def test_a_server_that_says_what_is_no_message_again_while_the_robot_leaves(
+def test_a_server_that_says_what_is_no_message_does_not_keep_a_robot_from_capturing(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot = make(100)
+    noise = Message(b"", b"\xff", robot.client)  # type: ignore[arg-type]
+    monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(noise))
+    robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
+    assert f"{robot.chunks} chunks kept for later: the server says what is no message" in robot.summary
+    assert caplog.text.count("use the same version on both ends") == 1, "once a minute"
+
+
+def test_a_socket_that_is_none_any_more_ends_a_robot_with_everything_closed(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = make(10)
-    monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(HandshakeFailed("")))
 
-    def refuses(*arguments: object) -> None:
-        raise NetworkError("the server says what is no message here")
+    def breaks(longest: float) -> None:
+        raise NetworkError("the socket cannot be read")
 
-    monkeypatch.setattr(robot.sender, "handle", refuses)
+    monkeypatch.setattr(robot.loop, "step", breaks)
     with pytest.raises(NetworkError):
         robot.run()
     assert robot.source.closed, "whoever publishes is told that nobody listens any more"  # type: ignore[attr-defined]
@@ -279,6 +321,22 @@ def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: 
         robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
     assert robot.captured == 10
     assert "kept for later" in robot.summary
+
+
+def test_a_live_source_that_dies_ends_the_robot_at_once_though_no_server_is_there(
+    make: Callable[[int], Robot], caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, began = make(0), time.monotonic()
+
+    def dies(emit: Callable[[RawMessage], None], stop: threading.Event) -> None:
+        raise SourceError("the graph was lost")
+
+    robot.source.run, robot.source.live = dies, True  # type: ignore[method-assign, misc]
+    turns = iter(range(100))
+    with pytest.raises(SourceError, match="the graph was lost"):
+        robot.run(on_turn=lambda: robot.stop() if next(turns) == 99 else None)
+    assert next(turns) < 99 and "the graph was lost" in caplog.text
+    assert time.monotonic() - began < 60 and robot.source.closed  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("marks", [512, 4])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import shutil
@@ -33,6 +34,19 @@ def all_of(spool: Spool) -> list[Chunk]:
 
 def numbers(chunks: list[Chunk]) -> list[int]:
     return [one.header.number for one in chunks]
+
+
+def test_a_disk_that_fails_beside_the_file_is_an_error_of_the_spool(tmp_path, monkeypatch):
+    spool = open_spool(tmp_path / "spool.sqlite")
+
+    def fails(path: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "statvfs", fails)
+    (tmp_path / "spool.sqlite.reserve").unlink()
+    with pytest.raises(StoreError, match="Input/output error"):
+        spool.append(chunk(0))
+    spool.close()
 
 
 # --- crashes
