@@ -398,8 +398,8 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[
     """scrypt-params after the salt, RFC 7914, 7: N, r, p."""
     N, r, p = parameters.integer(), parameters.integer(), parameters.integer()
     _read_key_length(parameters, key_length)
-    if N < 2 or N & (N - 1) or r < 1 or p < 1:
-        raise InvalidEncoding("scrypt's N must be a power of two above 1, its r and p positive")
+    if N < 2 or N & (N - 1) or r < 1 or p < 1 or N >> 16 * r:
+        raise InvalidEncoding("scrypt's N must be a power of two above 1 and below 2^(16*r), its r and p positive")
     if 128 * max(N, p) * r > MAX_SCRYPT_MEMORY or N * r * p > MAX_SCRYPT_BLOCKS:
         raise InvalidKey(
             f"the key file asks for scrypt with N*r = {N * r}, p = {p}; the limits are {MAX_SCRYPT_MEMORY} bytes"

@@ -10,6 +10,7 @@ tests do with the standards' sample curve.
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from hmac import compare_digest
 from typing import Any, Literal, NoReturn
 
@@ -44,11 +45,12 @@ class PublicKey:
     _point: Point
 
     def __init__(self, point: Point, curve: Curve = SM2P256V1) -> None:
+        require_type(point, Sequence, "point")
+        require_type(curve, Curve, "curve")
         if len(point) != 2:
             raise InvalidKey(f"a point has two coordinates, not {len(point)}")
-        for value in point:
-            require_int(value, "a coordinate")
-        object.__setattr__(self, "_point", require_point(point, curve))
+        x, y = (require_int(value, "a coordinate") for value in point)
+        object.__setattr__(self, "_point", require_point((x, y), curve))
         object.__setattr__(self, "_curve", curve)
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
@@ -238,6 +240,7 @@ class PrivateKey:
     _public_key: PublicKey | None
 
     def __init__(self, d: int, curve: Curve = SM2P256V1) -> None:
+        require_type(curve, Curve, "curve")
         if not 1 <= require_int(d, "d") <= curve.n - 2:
             raise InvalidKey("a private key must be in [1, n-2]")
         object.__setattr__(self, "_d", d)
@@ -255,6 +258,7 @@ class PrivateKey:
         >>> PrivateKey.generate() == PrivateKey.generate()
         False
         """
+        require_type(curve, Curve, "curve")
         return cls(secrets.randbelow(curve.n - 2) + 1, curve)
 
     @classmethod

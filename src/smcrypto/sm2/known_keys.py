@@ -11,6 +11,7 @@ that are gone before they are used.
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict
 from collections.abc import Sequence
 from threading import Lock
@@ -74,7 +75,8 @@ class KnownKeys:
             record.width = due
         comb = Comb(P, due, curve)
         with self._lock:
-            self._points += _points(comb) - _points(record.comb)
+            # The record in place is another where this key was put out meanwhile and earned a comb again.
+            self._points += _points(comb) - _points(self._known.get(key, record).comb)
             record.comb = comb
             self._candidates.pop(key, None)
             self._known[key] = record
@@ -113,3 +115,7 @@ def _points(comb: Comb | None) -> int:
 
 known_keys: Final = KnownKeys()
 """The memory that verification, encryption and key exchange share."""
+
+if hasattr(os, "register_at_fork"):  # not on Windows. A child that inherits the lock of another thread waits for ever.
+    _lock: Final = known_keys._lock
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)

@@ -493,6 +493,7 @@ WRONG_ENCRYPTED = {
     "scrypt beyond 256 MiB": (encrypted(derivation=scrypt(2**19, 8, 1)), "268435456 bytes"),
     "scrypt beyond 256 MiB by p": (encrypted(derivation=scrypt(2, 1, 2**22)), "268435456 bytes"),
     "scrypt beyond 256 MiB by p and r": (encrypted(derivation=scrypt(2, 2**20, 4)), "268435456 bytes"),
+    "scrypt N = 2^(16 r)": (encrypted(derivation=scrypt(2**16, 1, 1)), "and below 2"),
     "scrypt with too much work": (encrypted(derivation=scrypt(2**14, 8, 65)), "8388608"),
     "scrypt with a key length that does not fit": (encrypted(derivation=scrypt(16, 1, 1, 32)), "a key of 32 bytes"),
     "an empty ciphertext": (encrypted(ciphertext=b""), "the password is wrong"),
@@ -560,7 +561,7 @@ def test_iterations_are_bounded_when_a_key_is_written(monkeypatch: pytest.Monkey
             keyfiles.write_pbes2(b"a key", b"pw", "sha256", iterations)
 
 
-@pytest.mark.parametrize(("N", "r", "p"), [(2, 1, 1), (16, 8, 3), (16, 8, 64), (1 << 14, 8, 1)])
+@pytest.mark.parametrize(("N", "r", "p"), [(2, 1, 1), (16, 8, 3), (16, 8, 64), (1 << 14, 8, 1), (1 << 15, 1, 1)])
 def test_scrypt_as_hashlib_computes_it(N: int, r: int, p: int) -> None:
     key = hashlib.scrypt(b"pw", salt=b"salt", n=N, r=r, p=p, dklen=16)
     ciphertext = sm4.encrypt(key, sm4.CBC(bytes(16)), KEY.to_der(), padding="pkcs7")

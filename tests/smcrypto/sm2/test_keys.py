@@ -53,9 +53,23 @@ def test_public_keys_from_coordinates():
     assert PublicKey(SM2P256V1.G) == PrivateKey.from_int(1).public_key
     with pytest.raises(InvalidKey):
         PublicKey((1, 1))
-    for wrong in ((True, 1), (1.0, 2), ("1", 2)):
-        with pytest.raises(TypeError):
+    for wrong in ((True, 1), (1.0, 2), ("1", 2), None, 5, {*SM2P256V1.G}, dict([SM2P256V1.G]), iter(SM2P256V1.G)):
+        with pytest.raises(TypeError, match=r"coordinate|point"):
             PublicKey(wrong)
+
+
+def test_a_key_keeps_its_own_copy_of_the_point():
+    point = list(SM2P256V1.G)
+    key = PublicKey(point)
+    point[0] ^= 1
+    assert (key, hash(key), key.point) == (PublicKey(SM2P256V1.G), hash(PublicKey(SM2P256V1.G)), SM2P256V1.G)
+    key.verify(PrivateKey.from_int(1).sign(b"message"), b"message")
+
+
+def test_another_curve_is_a_curve():
+    for make in (lambda: PublicKey((1, 2), None), lambda: PrivateKey(5, "sm2p256v1"), lambda: PrivateKey.generate(b"")):
+        with pytest.raises(TypeError, match="curve must be a Curve"):
+            make()
 
 
 def test_a_point_is_two_coordinates():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -173,6 +176,50 @@ def test_several_threads_share_the_memory():
         list(pool.map(work, range(2000)))
     assert 1 <= len(memory) <= 4
     assert memory._points == sum(len(row) for known in memory._known.values() for row in known.comb.rows)
+
+
+def test_a_key_that_lost_its_comb_and_earned_another_while_a_wider_one_was_built_counts_once(monkeypatch):
+    memory = KnownKeys(stages=((1, 3), (20, 5)), points=3 * WIDTH_3)
+    P, *others = POINTS[:4]
+    built = []
+
+    def slow_comb(point, width, curve):
+        built.append(width)
+        if width == 5:  # meanwhile, in other threads, the others take all places, and P then one of theirs
+            for Q in (*others, P):
+                use(memory, Q, 16)
+                memory.comb(curve, Q)
+        return Comb(point, width, curve)
+
+    monkeypatch.setattr(module, "Comb", slow_comb)
+    use(memory, P, 1)
+    memory.comb(TINY_1009, P)
+    use(memory, P, 19)
+    assert memory.comb(TINY_1009, P).width == 5
+    assert built.count(3) == 5, "P had two narrow ones"
+    assert memory._points == sum(len(row) for known in memory._known.values() for row in known.comb.rows) <= 3 * WIDTH_3
+
+
+FORK = """
+import os, signal, threading
+from smcrypto.sm2.curve import SM2P256V1
+from smcrypto.sm2.known_keys import known_keys
+
+known_keys._lock.acquire()  # as another thread would hold it
+threading.Timer(0.1, known_keys._lock.release).start()
+child = os.fork()
+if not child:
+    signal.alarm(10)
+    known_keys.used(SM2P256V1, SM2P256V1.G)
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+known_keys.used(SM2P256V1, SM2P256V1.G)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_child_does_not_wait_for_a_thread_that_it_has_not():
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], check=True, timeout=60)
 
 
 def test_the_shared_memory_is_bounded():
