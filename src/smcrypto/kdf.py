@@ -18,7 +18,6 @@ __all__ = ["hkdf", "pbkdf2_hmac", "sm2_kdf"]
 _HASH = sm3.SM3.digest_size
 _SM2_LIMIT = _HASH * (2**32 - 1)
 _HKDF_LIMIT = 255 * _HASH
-_INT_MAX = 2**31 - 1
 
 
 def sm2_kdf(z: BytesLike, length: int) -> bytes:
@@ -76,9 +75,9 @@ def pbkdf2_hmac(password: BytesLike, salt: BytesLike, iterations: int, length: i
     '30530b86537c85ea'
     """
     password, salt = as_bytes(password, "password"), as_bytes(salt, "salt")
-    if not 1 <= require_int(iterations, "iterations") <= _INT_MAX:
+    if not 1 <= require_int(iterations, "iterations") <= sm3._INT_MAX:
         raise InvalidOption(f"iterations must be 1 ... 2^31 - 1, not {iterations}")
-    if not 1 <= require_int(length, "length") <= _INT_MAX:
+    if not 1 <= require_int(length, "length") <= sm3._INT_MAX:
         raise InvalidLength(f"length must be 1 ... 2^31 - 1 bytes, not {length}")
     if sm3.ENGINE == "openssl":
         return hashlib.pbkdf2_hmac("sm3", password, salt, iterations, length)

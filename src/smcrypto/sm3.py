@@ -141,7 +141,7 @@ def hmac(key: BytesLike, data: BytesLike) -> bytes:
     """
     key = as_bytes(key, "key")
     data = as_bytes(data, "data")
-    if ENGINE == "openssl":
+    if ENGINE == "openssl" and len(key) <= _INT_MAX and len(data) <= _INT_MAX:
         return _hmac.digest(key, data, "sm3")
     inner, outer = _keyed(key)
     inner.update(data)
@@ -149,6 +149,7 @@ def hmac(key: BytesLike, data: BytesLike) -> bytes:
     return outer.digest()
 
 
+_INT_MAX = 2**31 - 1  # of what OpenSSL counts in a C int
 _IPAD = bytes(x ^ 0x36 for x in range(256))
 _OPAD = bytes(x ^ 0x5C for x in range(256))
 

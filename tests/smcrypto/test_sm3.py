@@ -140,6 +140,16 @@ def test_streaming_hmac_of_the_standard_library(sm3_engine):
     assert mac.digest() == sm3.hmac(b"key" * 30, b"in pieces")
 
 
+def test_hmac_of_more_than_openssl_takes_at_once(monkeypatch):
+    def digest(key, data, name):
+        raise OverflowError("msg is too long.")
+
+    monkeypatch.setattr(hmac, "digest", digest)
+    monkeypatch.setattr(sm3, "_INT_MAX", 99)
+    for key, data in ((b"key", bytes(100)), (bytes(100), b"data")):
+        assert sm3.hmac(key, data) == hmac.new(key, data, sm3.SM3).digest()
+
+
 def every_second_byte(b: bytes) -> memoryview:
     return memoryview(b"x".join(bytes([c]) for c in b))[::2]
 
