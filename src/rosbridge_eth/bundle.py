@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.config.values import parse_address
-from rosbridge_eth.errors import ConfigError, IdentityError
+from rosbridge_eth.errors import BridgeError, ConfigError, IdentityError
 from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
 from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, new_home, require_empty
 from rosbridge_eth.identity import CERTIFICATE_FILES, KEY_FILES, check_name
@@ -163,10 +163,16 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
 
 def take_up(home: RobotHome) -> str | None:
     """Join with the bundle that was put into the home (RobotHome.answer), which then goes; the CA's fingerprint, or
-    None where there is none."""
+    None where there is none. A robot that has joined goes on as it is where that fails."""
     if not home.request.exists() or not home.answer.exists():
         return None
-    fingerprint = join(home, read_bundle(home.answer.read_bytes()))
+    try:
+        fingerprint = join(home, read_bundle(home.answer.read_bytes()))
+    except (BridgeError, OSError) as error:
+        if not home.bridge_file.exists():
+            raise
+        log.error("%s is not taken up: %s", home.answer, error)
+        return None
     home.answer.unlink()
     return fingerprint
 

@@ -74,6 +74,7 @@ class Robot:
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
+        self._dropped_before = spool.statistics().dropped_bodies
         self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
         self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
@@ -113,6 +114,11 @@ class Robot:
     def lost(self) -> dict[tuple[str, str], int]:
         """Messages that are not in the log, by topic and why: lost by the source, refused, no memory to keep them."""
         return {**self.source.lost, **self.capture.lost, **self.box.lost}
+
+    @property
+    def dropped(self) -> int:
+        """Chunks whose bodies the full spool gave up since the start."""
+        return self.spool.statistics().dropped_bodies - self._dropped_before
 
     @property
     def captured(self) -> int:
@@ -320,7 +326,7 @@ class Robot:
             "records that there was no memory for until their event": self.box.lost.total(),
             "messages lost, since the spool took nothing": len(self._ring) + len(self.box.released),
             "chunks lost, since the spool took nothing": len(self._unspooled),
-            "chunks dropped from the full spool": spool.dropped_bodies,
+            "chunks dropped from the full spool": self.dropped,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{self.captured} records captured in {self.chunks} chunks"]

@@ -88,6 +88,7 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
 
     monkeypatch.setattr(robot.spool, "append", maybe)
     monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.01)
+    monkeypatch.setattr("rosbridge_eth.robot.LONGEST_WAIT", 0.01)
     seen: list[int] = []
     turns = 0
 
@@ -244,7 +245,7 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
 ) -> None:
     robot = make(1000)
     Full(robot, monkeypatch)
-    for name, value in {"LOSSES_EVERY": 0.0, "MAX_UNSPOOLED": 3, "RING": 64}.items():
+    for name, value in {"LOSSES_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3, "RING": 64}.items():
         monkeypatch.setattr(f"rosbridge_eth.robot.{name}", value)
     waiting: list[int] = []
 
@@ -258,6 +259,17 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
     robot.run(on_turn=on_turn)
     assert waiting[-1] <= 4
     assert re.search(r"[1-9]\d+ messages lost, since the spool took nothing", robot.summary), "what the ring held"
+
+
+def test_what_an_earlier_run_dropped_is_not_told_of_this_one(make: Callable[[int], Robot]) -> None:
+    first = make(0)
+    with closing(first.loop), closing(first.spool):
+        for chunk in first.writer.finish(0):
+            first.spool.append(chunk)
+        first.spool._db.run("UPDATE spool SET dropped_bodies = 7")
+    robot = make(10)
+    robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
+    assert "dropped" not in robot.summary
 
 
 def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(

@@ -50,7 +50,7 @@ def _open(family: int) -> socket.socket:
 def _resolve(host: str, port: int, flags: int = 0) -> tuple[int, Address]:
     try:
         found = socket.getaddrinfo(host or None, port, type=socket.SOCK_DGRAM, flags=flags)
-    except (socket.gaierror, UnicodeError) as error:  # the latter for what cannot be a name
+    except (OSError, UnicodeError) as error:  # the latter for what cannot be a name
         raise NetworkError(
             f"the address {host!r} cannot be found: {getattr(error, 'strerror', error)}; see that this machine has a"
             " network and a name server, and that the name is right"
@@ -220,7 +220,7 @@ class ClientLoop(UdpLoop):
             answer, self._answer = self._answer, None
             try:
                 self._take(*answer.result(), now)
-            except NetworkError as error:
+            except (NetworkError, OSError) as error:  # the latter: such an address is of no use on this machine
                 self.resolved = False
                 self._on_event(Unresolved(str(error)))
         elif self._answer is None and now >= self._ask_at:

@@ -227,6 +227,19 @@ def test_a_name_is_asked_for_until_it_has_an_address_and_again_when_the_session_
     robot.close()
 
 
+@pytest.mark.parametrize("error", [OSError(errno.EMFILE, "Too many open files"), None], ids=str)
+def test_an_address_that_is_of_no_use_here_is_none(monkeypatch, error):
+    names, robot = Names(monkeypatch), NamedRobot()
+    names.address = ("::1", 7410)
+    if error is not None:  # EAI_SYSTEM
+        names._real = lambda *given, **more: (_ for _ in ()).throw(error)
+    else:
+        monkeypatch.setattr("rosbridge_eth.channel.udp._open", lambda family: socket.socket(99))
+    robot.until(lambda: robot.events)
+    assert isinstance(robot.events[0], Unresolved) and not robot.loop.resolved
+    robot.loop.close()
+
+
 def test_a_name_server_that_does_not_answer_keeps_nobody_waiting(monkeypatch):
     names = Names(monkeypatch)
     names.gate.clear()

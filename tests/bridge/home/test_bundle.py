@@ -212,6 +212,20 @@ def test_a_crash_while_joining_is_mended_by_joining_again(home: RobotHome, monke
         assert load_identity(home.identity, b"robot's")[0].name == "robot_1" and home.bridge() == END
 
 
+def test_a_bundle_that_cannot_be_taken_up_ends_no_robot_that_has_joined(
+    home: RobotHome, caplog: pytest.LogCaptureFixture
+) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    home.answer.write_bytes(bundle.encode()[:-100])  # a copy that was cut short
+    with pytest.raises(IdentityError, match="damaged"):
+        take_up(home)
+    join(home, bundle)
+    assert take_up(home) is None and home.answer.exists()
+    assert f"{home.answer} is not taken up: this is no bundle file" in caplog.text
+    home.answer.write_bytes(bundle.encode())
+    assert take_up(home) is not None
+
+
 def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_crash_fell(
     home: RobotHome, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
