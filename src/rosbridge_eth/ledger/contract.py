@@ -35,6 +35,7 @@ GAS_A_BYTE = 40
 NOTHING = bytes(32)  # the tail of a robot that wrote no chunk
 PAGE = 500  # robots in one `standings`
 SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
+RECEIPT_LATE = 5.0  # seconds that a node may know an account's nonce before it has the transaction's receipt
 SENT_AT_ONCE = 4  # of 200 kB in hex at most; nginx takes 1 MB where nobody said otherwise, anvil 2, geth 5
 _Event = TypeVar("_Event")
 _Answer = TypeVar("_Answer")
@@ -482,7 +483,7 @@ class Ledger:
         self, account: LocalAccount, data: bytes, value: int, gas: int, wait: float, *, creates: bool = False
     ) -> Receipt:
         """Behind what the account has in the pool; again with the next number if another transaction took its own."""
-        deadline, signed, nonce, pause = time.monotonic() + wait, None, 0, 0.02
+        deadline, signed, nonce, pause, passed = time.monotonic() + wait, None, 0, 0.02, 0.0
         refused: ChainError | None = None
         while time.monotonic() < deadline:
             if signed is None:
@@ -499,8 +500,10 @@ class Ledger:
                 if not receipt.succeeded:
                     raise transport.Reverted(f"transaction 0x{signed.hash.hex()} failed in block {receipt.block}")
                 return receipt
-            elif self.nonces([account.address])[0][0] > nonce and self.receipt(signed.hash) is None:
-                signed = None
+            elif self.nonces([account.address])[0][0] > nonce:  # ours, whose receipt is not there yet; or another's
+                passed = passed or time.monotonic()
+                if time.monotonic() - passed > RECEIPT_LATE:
+                    signed, passed = None, 0.0
             time.sleep(pause)
             pause = min(2 * pause, 1.0)
         if isinstance(refused, NonceTooLow | Underpriced):

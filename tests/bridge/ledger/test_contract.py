@@ -13,7 +13,7 @@ from eth_hash.auto import keccak
 from bridge.ledger.world import ETH, KEYS
 from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.ledger import Ledger, RegistrationEvent
+from rosbridge_eth.ledger import Ledger, RegistrationEvent, contract
 from rosbridge_eth.ledger.contract import NOTHING, Standing, artifact, set_data_cost, set_data_gas
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted, Underpriced
@@ -307,6 +307,27 @@ def test_a_transaction_that_another_one_overtakes_is_sent_with_the_next_nonce(ma
     answers = iter([stale])
     made.nonces = lambda accounts: next(answers, None) or real(accounts)  # type: ignore[method-assign]
     assert made.transact(OPERATOR, "offerOperator", ROBOT.address).succeeded
+
+
+def test_a_transaction_whose_receipt_comes_late_is_not_sent_again(made: Ledger, monkeypatch):
+    """A node may count a block's transactions before it can say what became of each: revoking twice would fail."""
+    real, late = made.receipt, iter([None] * 3)
+    monkeypatch.setattr(made, "receipt", lambda transaction: next(late, real(transaction)))
+    assert made.revoke_robot(OPERATOR, TK).succeeded
+
+
+def test_a_transaction_whose_place_another_one_took_in_the_pool_is_sent_with_the_next_nonce(made: Ledger, monkeypatch):
+    monkeypatch.setattr(contract, "RECEIPT_LATE", 0.1)
+    real = made.send
+
+    def overtaken(raws: list[bytes]) -> list[ChainError | None]:
+        """Says that it took it; and another transaction of the account has its number."""
+        monkeypatch.setattr(made, "send", real)
+        made.transact(OPERATOR, "offerOperator", OTHER.address)
+        return [None]
+
+    monkeypatch.setattr(made, "send", overtaken)
+    assert made.revoke_robot(OPERATOR, TK).succeeded
 
 
 def test_a_transaction_that_the_node_does_not_take_is_not_said_to_be_taken(made: Ledger, monkeypatch):
