@@ -113,7 +113,8 @@ def verify(
 
     data: SignedData in DER, or PEM labelled CMS or PKCS7. roots: trusted at the moment `at`; None leaves the trust
     in the signers' certificates to the caller. content: of a detached message, which must not have one inside.
-    intermediates, crls: as of `x509.verify_chain`; the certificates inside are used as well. uid: of the signers.
+    intermediates, crls: as of `x509.verify_chain`; the certificates and revocation lists inside are used as if given,
+    so a list inside must be in force at the moment `at`. uid: of the signers.
     InvalidEncoding: not such a message, or the content is missing or twice. InvalidSignature: a signature does not
     hold, or there is none. CertificateError: a signer is not to be trusted, or has no certificate here.
     """

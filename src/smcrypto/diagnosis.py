@@ -18,7 +18,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from smcrypto import pem, sm2, sm3, x509
 from smcrypto.errors import (
@@ -144,7 +144,21 @@ _HEX = re.compile(rb"(?:0[xX])?([0-9a-fA-F]+)")
 _BASE64 = re.compile(rb"[A-Za-z0-9+/_-]+={0,2}")
 
 
-def _unwrapped(data: bytes, remarks: list[str]) -> Iterator[tuple[str, bytes]]:
+class _Written(NamedTuple):
+    """How the bytes were written, in words, and the Python that makes them of `data`."""
+
+    words: str
+    python: str
+
+    def __str__(self) -> str:
+        return self.words
+
+    @property
+    def form(self) -> Literal["pem", "der"]:
+        return "pem" if self.words.startswith("PEM") else "der"
+
+
+def _unwrapped(data: bytes, remarks: list[str], python: str = "data") -> Iterator[tuple[_Written, bytes]]:
     """(how it was written, the bytes) for each way in which `data` can be read; hex in base64 and the like too."""
     if b"-----BEGIN " in data:
         try:
@@ -155,27 +169,32 @@ def _unwrapped(data: bytes, remarks: list[str]) -> Iterator[tuple[str, bytes]]:
         if not blocks:
             remarks.append("-----BEGIN stands there, but no line is a PEM boundary: is it indented, or one line?")
         for label, content in blocks:
-            yield f"PEM, label {label}", content
+            yield _Written(f"PEM, label {label}", python), content
         return
     text = re.sub(rb"[\s:]", b"", data)
+    string = python if python == "data" else f"{python}.decode()"
     if match := _HEX.fullmatch(text):
         digits = match[1]
+        for mark in ("0x", "0X", ":"):
+            string += f".replace({mark!r}, '')" if mark.encode() in data else ""
         if len(digits) % 2:
             remarks.append(f"{len(digits)} hex digits, an odd number: a leading zero was lost, or a digit")
-            digits = b"0" + digits
-        yield from _inner("hex", binascii.unhexlify(digits), remarks)
+            digits, string = b"0" + digits, f"'0' + {string}"
+        yield from _inner(_Written("hex", f"bytes.fromhex({string})"), binascii.unhexlify(digits), remarks)
     elif _BASE64.fullmatch(text) and len(text.rstrip(b"=")) % 4 != 1:
+        usual = len(text) % 4 == 0 and b"-" not in text and b"_" not in text
+        python = f"base64.b64decode({python})" if usual else f"base64.urlsafe_b64decode({string} + '===')"
         digits = text.rstrip(b"=").translate(bytes.maketrans(b"-_", b"+/"))
-        yield from _inner("base64", base64.b64decode(digits + b"=" * (-len(digits) % 4)), remarks)
+        yield from _inner(_Written("base64", python), base64.b64decode(digits + b"=" * (-len(digits) % 4)), remarks)
     else:
-        yield "bytes", data
+        yield _Written("bytes", python), data
 
 
-def _inner(how: str, content: bytes, remarks: list[str]) -> Iterator[tuple[str, bytes]]:
+def _inner(how: _Written, content: bytes, remarks: list[str]) -> Iterator[tuple[_Written, bytes]]:
     text = content.strip()
-    if b"-----BEGIN " in text or (len(text) >= 32 and (_HEX if how == "base64" else _BASE64).fullmatch(text)):
-        for deeper, inside in _unwrapped(content, remarks):
-            yield f"{deeper} in {how}", inside
+    if b"-----BEGIN " in text or (len(text) >= 32 and (_HEX if how.words == "base64" else _BASE64).fullmatch(text)):
+        for deeper, inside in _unwrapped(content, remarks, how.python):
+            yield deeper._replace(words=f"{deeper} in {how}"), inside
     else:
         yield how, content
 
@@ -183,7 +202,7 @@ def _inner(how: str, content: bytes, remarks: list[str]) -> Iterator[tuple[str, 
 # --- bytes to things ---
 
 
-def _readings(data: bytes, how: str, given: _Given, remarks: list[str]) -> Iterator[Reading]:
+def _readings(data: bytes, how: _Written, given: _Given, remarks: list[str]) -> Iterator[Reading]:
     private, public = _private_key(data, given.password, remarks), _public_key(data)
     if private:
         yield _of_private_key(*private, how, given)
@@ -193,7 +212,7 @@ def _readings(data: bytes, how: str, given: _Given, remarks: list[str]) -> Itera
         yield from _signatures(data, how, given)
     yield from _ciphertexts(data, how, given)
     yield from _documents(data, how, given)
-    if len(data) == 16 and how != "bytes":
+    if len(data) == 16 and how.words != "bytes":
         yield Reading("16 bytes", f"in {how}: an SM4 key, IV or block", calls=(("smcrypto", "sm4.SM4(key)"),))
 
 
@@ -229,18 +248,17 @@ def _public_key(data: bytes) -> tuple[sm2.PublicKey, str] | None:
         return None
 
 
-def _of_private_key(key: sm2.PrivateKey, form: str, how: str, given: _Given) -> Reading:
+def _of_private_key(key: sm2.PrivateKey, form: str, how: _Written, given: _Given) -> Reading:
     verdict = ""
     if given.public is not None:
         fits = key.public_key == given.public
         verdict = "it is the given key's" if fits else "it is another key than the one given"
     d, xy = "D", key.public_key.to_bytes()[1:].hex()
-    if how.startswith("PEM") or form.startswith("DER"):
-        kind = "pem" if how.startswith("PEM") else "der"
-        option = "" if kind == "pem" else " -inform DER"
+    if how.form == "pem" or form.startswith("DER"):
+        option = "" if how.form == "pem" else " -inform DER"
         secret = ", password" if form.endswith("encrypted") else ""
         calls = (
-            ("smcrypto", f"sm2.PrivateKey.from_{kind}({_expression(how, 'data')}{secret})"),
+            ("smcrypto", f"sm2.PrivateKey.from_{how.form}({how.python}{secret})"),
             ("gmssl", f'takes hex: CryptSM2(private_key=key.to_bytes().hex(), public_key="{xy}")'),
             ("sm-crypto", "takes hex: key.to_bytes().hex()"),
             ("Bouncy Castle", "(ECPrivateKey) KeyFactory.getInstance(\"EC\", \"BC\")"
@@ -249,7 +267,7 @@ def _of_private_key(key: sm2.PrivateKey, form: str, how: str, given: _Given) -> 
         )
     else:
         calls = (
-            ("smcrypto", f"sm2.PrivateKey.from_bytes({_expression(how, 'data')}{'[1:]' if form[:2] == '33' else ''})"),
+            ("smcrypto", f"sm2.PrivateKey.from_bytes({how.python}{'[1:]' if form[:2] == '33' else ''})"),
             ("gmssl", f'CryptSM2(private_key={d}, public_key="{xy}")   # D: the 64 hex digits of d'),
             ("sm-crypto", f'sm2.doDecrypt(c, {d}), sm2.doSignature(m, {d}, {{hash: true}})   // D: the 64 hex digits'),
             ("Bouncy Castle", f"new ECPrivateKeyParameters(new BigInteger({d}, 16), domain)   // domain of sm2p256v1"),
@@ -258,18 +276,17 @@ def _of_private_key(key: sm2.PrivateKey, form: str, how: str, given: _Given) -> 
     return Reading("private key", f"{form}, in {how}; its public key is 04{xy}", verdict, calls)
 
 
-def _of_public_key(key: sm2.PublicKey, form: str, how: str, given: _Given) -> Reading:
+def _of_public_key(key: sm2.PublicKey, form: str, how: _Written, given: _Given) -> Reading:
     verdict = ""
     if given.public is not None:
         verdict = "it belongs to the given key" if key == given.public else "it is of another key than the one given"
     xy = key.to_bytes()[1:].hex()
     if form.startswith("DER"):
-        kind = "pem" if how.startswith("PEM") else "der"
-        ours = f"sm2.PublicKey.from_{kind}({_expression(how, 'data')})"
-        theirs = f"openssl pkey -pubin -in FILE{'' if kind == 'pem' else ' -inform DER'} -noout -text"
+        ours = f"sm2.PublicKey.from_{how.form}({how.python})"
+        theirs = f"openssl pkey -pubin -in FILE{'' if how.form == 'pem' else ' -inform DER'} -noout -text"
     else:
         start = r"b'\x04' + " if form.startswith("64") else ""
-        ours = f"sm2.PublicKey.from_bytes({start}{_expression(how, 'data')})"
+        ours = f"sm2.PublicKey.from_bytes({start}{how.python})"
         theirs = "reads PEM and DER: write it with key.to_pem()"
     calls = (
         ("smcrypto", ours),
@@ -281,17 +298,10 @@ def _of_public_key(key: sm2.PublicKey, form: str, how: str, given: _Given) -> Re
     return Reading("public key", f"{form}, in {how}", verdict, calls)
 
 
-def _expression(how: str, name: str) -> str:
-    """Python that makes the bytes of the text."""
-    if how in ("hex", "base64"):
-        return f"bytes.fromhex({name})" if how == "hex" else f"base64.b64decode({name})"
-    return name
-
-
 # --- signatures ---
 
 
-def _signatures(data: bytes, how: str, given: _Given) -> Iterator[Reading]:
+def _signatures(data: bytes, how: _Written, given: _Given) -> Iterator[Reading]:
     for encoding in ("der", "raw"):
         try:
             r, s = decode_signature(data, SM2P256V1, encoding)
@@ -356,11 +366,11 @@ def _signature_verdict(r: int, s: int, given: _Given) -> tuple[str, _Candidate |
 
 
 def _signature_calls(
-    r: int, s: int, encoding: str, how: str, given: _Given, found: _Candidate | None
+    r: int, s: int, encoding: str, how: _Written, given: _Given, found: _Candidate | None
 ) -> tuple[tuple[str, str], ...]:
     raw, whole = (encode_signature(r, s, SM2P256V1, form).hex() for form in ("raw", "der"))
     uid = given.uids[0] if found is None else found.uid
-    octets = _expression(how, "data")
+    octets = how.python
     named = "" if encoding == "der" else ', encoding="raw"'
     if uid is None:
         ours = f"key.verify_digest({octets}, e{named})   # e: 32 bytes, made as said above"
@@ -390,7 +400,7 @@ _FORMS: Sequence[tuple[str, str]] = (
 )  # fmt: skip
 
 
-def _ciphertexts(data: bytes, how: str, given: _Given) -> Iterator[Reading]:
+def _ciphertexts(data: bytes, how: _Written, given: _Given) -> Iterator[Reading]:
     """With the private key only what opens; without it both orders, for nothing but the key tells them apart."""
     found: list[Reading] = []
     for encoding, form in _FORMS:
@@ -418,11 +428,11 @@ def _ciphertexts(data: bytes, how: str, given: _Given) -> Iterator[Reading]:
 
 
 def _ciphertext_calls(
-    C1: tuple[int, int], C3: bytes, C2: bytes, encoding: str, how: str, bare: bool
+    C1: tuple[int, int], C3: bytes, C2: bytes, encoding: str, how: _Written, bare: bool
 ) -> tuple[tuple[str, str], ...]:
     order = "c1c3c2" if encoding == "der" else encoding
     mode = int(order == "c1c3c2")
-    octets = ("b'\\x04' + " if bare else "") + _expression(how, "data")
+    octets = ("b'\\x04' + " if bare else "") + how.python
     plain = encode_ciphertext(C1, C3, C2, SM2P256V1, order)
     whole = encode_ciphertext(C1, C3, C2, SM2P256V1, "der")
 
@@ -444,11 +454,10 @@ def _ciphertext_calls(
 # --- what holds keys and signatures ---
 
 
-def _documents(data: bytes, how: str, given: _Given) -> Iterator[Reading]:
+def _documents(data: bytes, how: _Written, given: _Given) -> Iterator[Reading]:
     if data[:1] != b"\x30":
         return
-    form = "pem" if how.startswith("PEM") else "der"
-    option = "" if form == "pem" else " -inform DER"
+    option = "" if how.form == "pem" else " -inform DER"
     for what, kind, command in (
         ("certificate", x509.Certificate, "x509"),
         ("certificate signing request", x509.CertificateSigningRequest, "req"),
@@ -463,7 +472,7 @@ def _documents(data: bytes, how: str, given: _Given) -> Iterator[Reading]:
             fits = found.public_key == given.public
             verdict = "it holds the given key" if fits else "it holds another key than the one given"
         calls = (
-            ("smcrypto", f"x509.{kind.__name__}.from_{form}({_expression(how, 'data')})"),
+            ("smcrypto", f"x509.{kind.__name__}.from_{how.form}({how.python})"),
             ("openssl", f"openssl {command} -in FILE{option} -noout -text"),
         )
         yield Reading(what, f"DER, in {how}: {found!r}", verdict, calls)

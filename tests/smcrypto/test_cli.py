@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import getpass
+import hashlib
 import hmac
 import importlib
 import io
@@ -60,6 +61,15 @@ def test_hash_prints_as_sha256sum_does(folder: Path, capsys: pytest.CaptureFixtu
     Path("abc").write_bytes(b"abc")
     assert main(["hash", "abc", "abc"]) == 0
     assert capsys.readouterr().out == f"{ABC_DIGEST}  abc\n" * 2
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\\b", "plain"])
+def test_names_are_escaped_as_sha256sum_does(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(name).write_bytes(b"abc")
+    assert main(["hash", name]) == 0
+    theirs = subprocess.run(["sha256sum", name], capture_output=True, check=True).stdout.decode()
+    ours = capsys.readouterr().out
+    assert ours.replace(ABC_DIGEST, "") == theirs.replace(hashlib.sha256(b"abc").hexdigest(), "")
 
 
 def test_hash_reads_a_pipe() -> None:

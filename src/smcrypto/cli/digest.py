@@ -29,7 +29,7 @@ def run_hash(options: argparse.Namespace) -> int:
         state = sm3.SM3()
         for chunk in chunks(name):
             state.update(chunk)
-        print(f"{state.hexdigest()}  {name}")
+        _print(state.hexdigest(), name)
     return 0
 
 
@@ -39,5 +39,11 @@ def run_hmac(options: argparse.Namespace) -> int:
         state = hmac.new(key, digestmod=sm3.SM3)
         for chunk in chunks(name):
             state.update(chunk)
-        print(f"{state.hexdigest()}  {name}")
+        _print(state.hexdigest(), name)
     return 0
+
+
+def _print(digest: str, name: str) -> None:
+    """A line of sha256sum: a name that would break it is escaped, and a backslash before the digest says so."""
+    escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
+    print(f"{'' if escaped == name else chr(92)}{digest}  {escaped}")
