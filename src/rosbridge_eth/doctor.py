@@ -25,6 +25,7 @@ import typer
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth import sources
+from rosbridge_eth.archive import open_archive
 from rosbridge_eth.bundle import needs_password, read_bundle
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
@@ -36,6 +37,8 @@ from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError, Store
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.registry import Registry
+from rosbridge_eth.robot import certificate_clock, clock_synchronised, reader_keys
+from rosbridge_eth.sender import mend
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.status import ANSWER_TIME, DEAD, span
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
@@ -93,8 +96,6 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
 
 
 def clock(home: Home, secret: bytes | None) -> Findings:
-    from rosbridge_eth.robot import clock_synchronised
-
     now = datetime.now(UTC)
     if now.year < 2026:
         yield broken("clock", f"it says {now:%Y-%m-%d}", "set the clock; certificates are refused before their time")
@@ -128,8 +129,7 @@ def disk(home: Home, secret: bytes | None) -> Findings:
         yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home.path}",
                      "make room: until there is some nothing more is taken; what was taken is safe")
     elif free < SOME_ROOM:
-        yield note("disk", f"{free >> 20} MiB free at {home.path}",
-                   "make room; chunks wait here while the chain is away")
+        yield note("disk", f"{free >> 20} MiB free at {home.path}", "make room; chunks wait here if the chain is away")
     else:
         yield ok("disk", f"{free >> 30} GiB free")
 
@@ -159,19 +159,17 @@ def monitor(address: Address | None, runs: bool) -> Findings:
     """Is the port of /metrics free, or does the process that should have it answer there?"""
     if address is None:
         return
-    conditions: dict[str, bool] = {}
-    taken = None
+    conditions, taken = dict[str, bool](), ""
     with socket.socket(socket.AF_INET6 if ":" in address.host else socket.AF_INET) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(tuple(address))
         except OSError as error:
-            taken = error.strerror
+            taken = error.strerror or str(error)
     if taken and runs:
-        with (
-            suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError),
-            closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection,
-        ):
+        with suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError), closing(
+            http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)
+        ) as connection:
             connection.request("GET", "/readyz")
             conditions = dict(jsonlib.loads(connection.getresponse().read())["conditions"])
     failing = [name for name, holds in conditions.items() if not holds]
@@ -200,8 +198,9 @@ def shake_hands(
         loop.step(0.0)
     ends = [event for event in events if isinstance(event, Connected | HandshakeFailed)]
     # A session, else a refusal with its reason: one attempt may have lost what another was told.
-    ends.sort(key=lambda end: (isinstance(end, HandshakeFailed), getattr(end, "hint", None) is None))
-    return [*ends, HandshakeFailed("no answer")][0], client.statistics()["datagrams_received"]
+    best = min(ends, key=lambda end: (isinstance(end, HandshakeFailed), getattr(end, "hint", None) is None),
+               default=HandshakeFailed("no answer"))
+    return best, client.statistics()["datagrams_received"]
 
 
 def chain(ledger: Ledger) -> Findings:
@@ -215,11 +214,9 @@ def chain(ledger: Ledger) -> Findings:
         yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
     elif age > OLD_HEAD:
         result = broken if age > DEAD_HEAD else note
-        yield result(
-            "clock", f"by it, the last block is {span(age)} old",
-            "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain makes the"
-            " next one with the next transaction)",
-        )
+        yield result("clock", f"by it, the last block is {span(age)} old",
+                     "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
+                     " makes the next one with the next transaction)")
 
 
 # An operator's home
@@ -315,8 +312,6 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
 
 def archive(home: OperatorHome, secret: bytes | None) -> Findings:
     """The operator's archive keeps an object and gives it back."""
-    from rosbridge_eth.archive import open_archive
-
     config = load_server_config(home.config).archive
     if config is None:
         return
@@ -330,8 +325,6 @@ def archive(home: OperatorHome, secret: bytes | None) -> Findings:
 
 
 def readers_archive(home: ReaderHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.archive import open_archive
-
     config = load_reader_config(home.config).archive
     if config is not None:
         opened = open_archive(config)
@@ -385,8 +378,6 @@ def robot_certificates(home: RobotHome, secret: bytes | None) -> Findings:
 
 
 def readers(home: RobotHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.robot import reader_keys
-
     roots = ids.read_certificates((home.identity / "ca.crt.pem").read_bytes())
     yield ok("readers", f"{len(reader_keys(load_robot_config(home.config), home, roots))} can open what it writes")
 
@@ -406,9 +397,6 @@ def source(home: RobotHome, secret: bytes | None) -> Findings:
 
 def session(home: RobotHome, secret: bytes | None) -> Findings:
     """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
-    from rosbridge_eth.robot import certificate_clock
-    from rosbridge_eth.sender import mend
-
     end, config, runs = home.bridge(), load_robot_config(home.config), False
     log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
     try:
@@ -430,11 +418,9 @@ def session(home: RobotHome, secret: bytes | None) -> Findings:
     trust, wall = ids.Trust(roots), certificate_clock(home)
     found, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
     if isinstance(found, HandshakeFailed):
-        silent = (
+        yield broken("server", f"{server}: {found.why}", mend(found, config.channel) if answers else (
             f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
-            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'
-        )
-        yield broken("server", f"{server}: {found.why}", mend(found, config.channel) if answers else silent)
+            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'))
         return
     yield ok("server", f"{server} made a session")
     off = 0.0 if found.server_time is None else time.time() - found.server_time.timestamp()
@@ -446,7 +432,7 @@ def session(home: RobotHome, secret: bytes | None) -> Findings:
 # A reader's folder
 
 
-def reader_keys(home: ReaderHome, secret: bytes | None) -> Findings:
+def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
     folder = load_reader_config(home.config).identity
     yield from certificates(folder, "let the operator make this reader anew (`reader NAME --replace`)")
     if secret is None:
@@ -480,7 +466,7 @@ CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
         "server": session,
     }),
     HomeKind.READER: (ReaderHome, _MACHINE | {
-        "keys": reader_keys, "node": reader_nodes, "archive": readers_archive}),
+        "keys": own_keys, "node": reader_nodes, "archive": readers_archive}),
 }  # fmt: skip
 
 
@@ -495,9 +481,8 @@ def add_commands(app: typer.Typer) -> None:
 
 def doctor(
     home: AnyHomeOption = OPERATOR_HOME,
-    passphrase: Annotated[
-        Path | None, typer.Option("--passphrase-file", help="Of this home's keys (a robot's password), to try them."),
-    ] = None,
+    passphrase: Annotated[Path | None, typer.Option(
+        "--passphrase-file", help="Of this home's keys (a robot's password), to try them.")] = None,
     json: Json = False,
 ) -> None:
     """Try everything this home depends on, and name the mend for what does not work. An operator's, robot's, reader's.

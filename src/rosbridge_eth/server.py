@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -142,7 +142,7 @@ class Reception:
                         " which case revoke it and register it anew", peer,
                     )  # fmt: skip
                 log.info("%s: session begun", peer)
-                self._look_at = now  # its handshake may have been allowed before the list changed
+                self.look(now, [session])  # its handshake may have been allowed before the list changed
             case Disconnected(reason=reason, connection=connection):
                 ended = self.sessions.pop(connection, None)
                 if ended is not None:
@@ -325,7 +325,7 @@ class Reception:
             self._look_at = now + LOOK_EVERY
             self._append([], now, wall)
             self._look_at_archive(now)
-            self.look(now)
+            self.look(now, [*self.sessions.values()])
 
     def commit(self, now: float, wall: float) -> None:
         """Everything gathered goes into the inbox by one commit; then each robot is answered."""
@@ -397,9 +397,9 @@ class Reception:
 
     # Once a second
 
-    def look(self, now: float) -> None:
+    def look(self, now: float, sessions: Sequence[Session]) -> None:
         """Tell what is confirmed, ask those that hold to go on, close the sessions of who is not allowed any more."""
-        in_force, sessions = self._in_force(), [*self.sessions.values()]
+        in_force = self._in_force()
         try:
             states = self._inbox.states([session.tk for session in sessions])
         except StoreError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Disconnected, End, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.inbox import RobotState
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.server import Reception, Worker
 
@@ -83,6 +84,25 @@ def test_other_robots_and_a_robot_that_comes_again_are_no_reason(
     machine(ROBOTS[0], serving).close()
     other.close()
     assert warnings(caplog) == []
+
+
+def test_a_robot_that_comes_costs_a_look_at_itself_and_not_at_all_the_others(
+    serving: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thousands come at once after a restart."""
+    asked: list[int] = []
+    states = SqliteInbox.states
+
+    def counted(inbox: SqliteInbox, tks: Sequence[bytes]) -> dict[bytes, RobotState]:
+        asked.append(len(tks))
+        return states(inbox, tks)
+
+    monkeypatch.setattr("rosbridge_eth.server.LOOK_EVERY", 1e6)
+    monkeypatch.setattr(SqliteInbox, "states", counted)
+    machines = [machine(robot, serving) for robot in ROBOTS]
+    assert [count for count in asked if count] == [1, 1]
+    for one in machines:
+        one.close()
 
 
 def test_the_worker_ends_the_session_that_was_replaced(serving: Running) -> None:

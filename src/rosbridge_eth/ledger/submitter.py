@@ -353,7 +353,7 @@ class Submitter:
             return 0
         if in_pool > flights:
             return None
-        account.fees = self._fees.at_least(account.fees) if in_pool and account.fees else self._fees
+        account.fees = self._fees.at_least(account.fees) if flights and account.fees else self._fees
         self.counts["again"] += flights - in_pool
         return in_pool
 
@@ -425,7 +425,8 @@ class Submitter:
                 case NonceTooLow():
                     account.nonce, account.flights = None, []
                 case Underpriced():
-                    account.fees = offered.raised()
+                    account.fees = offered.raised().limited(self._settings.max_fee)
+                    self.trouble = str(error) if account.fees == offered else self.trouble
                 case _:
                     self.trouble = str(error)
         outbox.clear()

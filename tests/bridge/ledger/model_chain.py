@@ -53,6 +53,7 @@ class ModelChain:
         self.pool: dict[str, dict[int, Transaction]] = {}
         self.known: dict[bytes, Transaction] = {}
         self.base_fee, self.reverted, self.forks, self.history = GWEI, 0, 0, 100
+        self.least_tip = 0  # that the pool takes
         self.down = False  # no request is answered
         self.mute = False  # transactions are taken, and the answer is lost
 
@@ -213,6 +214,8 @@ class ModelChain:
             return AlreadyKnown("already known")
         if there and 10 * tx.fees.highest < 11 * there.fees.highest:
             return Underpriced("replacement transaction underpriced")
+        if (tx.fees.tip or 0) < self.least_tip:
+            return Underpriced(f"transaction underpriced: tip needed {self.least_tip}, tip permitted {tx.fees.tip}")
         if self.state.balances[tx.sender] < tx.gas * tx.fees.highest + tx.value:
             return OutOfFunds("insufficient funds for gas * price + value")
         waiting[tx.nonce] = tx

@@ -200,6 +200,22 @@ def test_a_price_that_rises_is_followed_up_to_the_limit(tmp_path: Path):
     assert world.model.reverted == 0
 
 
+def test_a_node_that_wants_a_higher_tip_than_it_suggests_is_given_it_up_to_the_limit(tmp_path: Path):
+    world = World(tmp_path, max_fee=50 * GWEI, low_water=0)
+    world.model.least_tip = 3 * GWEI
+    world.take(world.pen.chunks(3))
+    world.run()
+    assert world.submitter.trouble is None
+    world.model.least_tip = 51 * GWEI
+    world.take(world.pen.chunks(1))
+    for _ in range(60):
+        world.turn()
+    assert "tip needed 51000000000" in str(world.submitter.trouble)
+    world.model.least_tip = 0
+    world.run()
+    assert world.submitter.trouble is None
+
+
 def test_transactions_of_somebody_else_are_waited_for(world: World):
     world.take(world.pen.chunks(3))
     world.turn(mine=1)
