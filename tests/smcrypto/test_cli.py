@@ -270,6 +270,9 @@ def test_names_that_the_terminal_cannot_write_are_escaped(folder: Path) -> None:
     done = subprocess.run([sys.executable, "-m", "smcrypto", "hash", "报文"], capture_output=True, check=True,
                           env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"})  # fmt: skip
     assert done.stdout == f"{ABC_DIGEST}  \\u62a5\\u6587\n".encode() and done.stderr == b""
+    done = subprocess.run([sys.executable, "-m", "smcrypto", "ca", "verify", "--help"], capture_output=True, check=True,
+                          env=ENVIRONMENT | {"PYTHONIOENCODING": "ascii"})  # fmt: skip
+    assert b"serverAuth, \\u2026" in done.stdout
 
 
 def test_output_goes_wherever_stdout_was_redirected_to(folder: Path) -> None:

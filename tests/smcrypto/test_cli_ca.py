@@ -255,6 +255,11 @@ def test_hostile_names_do_not_reach_the_terminal(folder: Path, capsys: pytest.Ca
     run("show", "evil.csr")
     shown = capsys.readouterr().out
     assert "\x1b" not in shown and "\\1b" in shown and shown.count("\n  subject:") == 1
+    names = ("URI:urn:x, DNS:bank.example", "DNS:robot.example")
+    csr = x509.CertificateSigningRequest.create(key, subject={"CN": "x"}, subject_alt_names=names)
+    Path("evil.csr").write_bytes(csr.to_pem())
+    run("show", "evil.csr")
+    assert tuple(line[24:] for line in capsys.readouterr().out.splitlines()[2:4]) == names
 
 
 def test_openssl_accepts_the_chain(fleet: Path, require: Callable[[str], str]) -> None:

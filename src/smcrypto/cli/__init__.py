@@ -52,9 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Python has None for a stream that was closed before it came; what stands in its place refuses all but to be there.
     sys.stdin, sys.stdout = sys.stdin or open(os.devnull, "w"), sys.stdout or open(os.devnull)  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    options = build_parser().parse_args(arguments)
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files and people go to terminals that cannot write them
         sys.stdout.reconfigure(errors="backslashreplace")
+    options = build_parser().parse_args(arguments)
     try:
         code: int = options.run(options)
         sys.stdout.flush()

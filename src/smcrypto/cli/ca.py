@@ -283,8 +283,11 @@ def run_show(options: argparse.Namespace) -> int:
             continue
         shown += 1
     if not shown:
-        raise CertificateError("no certificate, request or revocation list in the input")
+        raise CertificateError("no certificate, request or revocation list in PEM (`diagnose` reads DER as well)")
     return 0
+
+
+_ONE_A_LINE = "\n" + 24 * " "  # a name may have commas and blanks in it
 
 
 def _lines(title: str, fields: dict[str, object]) -> str:
@@ -313,7 +316,7 @@ def _describe_certificate(certificate: x509.Certificate) -> str:
         "CA": ca,
         "key usage": _listed(certificate.key_usage),
         "extended key usage": _listed(certificate.extended_key_usage),
-        "alternative names": _listed(certificate.subject_alt_names),
+        "alternative names": _ONE_A_LINE.join(certificate.subject_alt_names) or None,
         "key identifier": None if identifier is None else identifier.hex(),
         "public key": certificate.public_key.to_bytes().hex(),
         "SM3 fingerprint": certificate.fingerprint().hex(),
@@ -325,7 +328,7 @@ def _describe_request(request: x509.CertificateSigningRequest) -> str:
         "subject": request.subject,
         "key usage": _listed(request.key_usage),
         "extended key usage": _listed(request.extended_key_usage),
-        "alternative names": _listed(request.subject_alt_names),
+        "alternative names": _ONE_A_LINE.join(request.subject_alt_names) or None,
         "public key": request.public_key.to_bytes().hex(),
     })  # fmt: skip
 
