@@ -3,7 +3,8 @@
 //
 //   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX] [--archive FOLDER]
 //
-// --key is the reader's private encryption key, 32 bytes in hex; without it everything but the content is checked.
+// --key is the reader's private encryption key, 32 bytes in hex; without it everything but the content is checked. It is
+//   sm2.PrivateKey.from_pem(open("enc.key.pem", "rb").read(), password=b"…").to_bytes().hex() in smcrypto.
 // --archive is a folder with the bodies of archived chunks, or a copy of it; without it they are not looked at.
 // Proven records go to stdout as JSON lines, the verdict as one JSON object to stderr. Exit code 0: sound; 9: not.
 
@@ -200,6 +201,11 @@ function frameEnd(data) {
 const { values: options } = parseArgs({
   options: Object.fromEntries(['node', 'contract', 'robot', 'ca', 'key', 'archive'].map((name) => [name, { type: 'string' }])),
 })
+const wanted = ['node', 'contract', 'robot', 'ca'].filter((name) => !options[name])
+if (wanted.length) {
+  console.error(`give ${wanted.map((name) => `--${name}`).join(', ')}, as the head of this file says`)
+  process.exit(2)
+}
 const provider = new JsonRpcProvider(options.node, undefined, { staticNetwork: true })
 const contract = new Contract(options.contract, ABI, provider)
 const { chainId } = await provider.getNetwork()

@@ -246,11 +246,13 @@ def demo(
         home = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosbridge-eth-"))
         with closing(BagSource(chosen, Selection(topics))) as opened:
             total = opened.message_count
-        bars = {name: progress.add_task(name, total=total) for name in ("captured", "stored", "verified")}
+        names = {"captured": "records captured", "stored": "lines stored", "verified": "records verified"}
+        bars = {stage: progress.add_task(name, total=total) for stage, name in names.items()}
 
         def show(stages: Stages) -> None:
             for name, bar in bars.items():
-                progress.update(bar, completed=getattr(stages, name))
+                done = getattr(stages, name)
+                progress.update(bar, completed=done, total=max(total, done))  # more lines than records: types have some
 
         result = run_demo(
             Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
@@ -319,7 +321,7 @@ def _html(
 <style>
 body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
 table {{ border-collapse: collapse; margin: .5rem 0 1.5rem }} td, th {{ border: 1px solid #ccc; padding: .2rem .7rem }}
-td {{ font-variant-numeric: tabular-nums }} .wide {{ overflow-x: auto }}
+td {{ font-variant-numeric: tabular-nums; overflow-wrap: anywhere }} .wide {{ overflow-x: auto }}
 .verdict {{ font-weight: 600; color: {"#1a6b3c" if result.passed else "#a32020"} }}
 img {{ max-width: 100% }} code {{ overflow-wrap: anywhere }}
 </style>

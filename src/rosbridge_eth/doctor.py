@@ -77,7 +77,9 @@ ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note
 
 
 def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Findings:
-    """Run the checks one after the other; a failure of the bridge's own is a finding, and its text has the mend."""
+    """Run the checks one after the other; a failure of the bridge's own is a finding, and its text has the mend. What
+    ends several checks is told once."""
+    told = set[str]()
     for what, check in checks.items():
         try:
             yield from check(home, secret)
@@ -86,6 +88,9 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
             yield broken(what, f"{f'{name}: ' if name else ''}{getattr(error, 'strerror', None) or error}",
                          "see that it is there, whole, and this user's to read")
         except BridgeError as error:
+            if str(error) in told:
+                continue
+            told.add(str(error))
             # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
             parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
             found, mark, mend = next((part for part in parts if part[2]), (str(error), "", ""))
@@ -378,6 +383,7 @@ def robot_certificates(home: RobotHome, secret: bytes | None) -> Findings:
 
 
 def readers(home: RobotHome, secret: bytes | None) -> Findings:
+    home.bridge()  # with which the CA's certificate came
     roots = ids.read_certificates((home.identity / "ca.crt.pem").read_bytes())
     yield ok("readers", f"{len(reader_keys(load_robot_config(home.config), home, roots))} can open what it writes")
 
@@ -499,7 +505,7 @@ def doctor(
     for finding in examine(checks, of(home), secret):
         findings.append(finding)
         if not json and finding.result != "ok":
-            talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}. {finding.mend}")
+            talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}; {finding.mend}")
     count = sum(finding.result == "broken" for finding in findings)
     if json:
         print_json({"home": str(home), "kind": kind, "broken": count, "findings": [f._asdict() for f in findings]})

@@ -378,4 +378,8 @@ def save_identity(folder: Path, identity: Identity, roots: Sequence[x509.Certifi
 def load_identity(folder: Path, password: bytes | None) -> tuple[Identity, tuple[x509.Certificate, ...]]:
     """Read what `save_identity` wrote; a key file that others may read is refused."""
     names = (*KEY_FILES, *CERTIFICATE_FILES)
-    return identity_from_files({name: read_file(folder / name, private=name in KEY_FILES) for name in names}, password)
+    files = {name: read_file(folder / name, private=name in KEY_FILES) for name in names}
+    try:
+        return identity_from_files(files, password)
+    except IdentityError as error:
+        raise IdentityError(f"{folder}: {error}; give the password it has, or restore it from a backup") from error

@@ -27,7 +27,7 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
-from rosbridge_eth.config.values import Address, parse_address, time_text
+from rosbridge_eth.config.values import Address, counted, parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
@@ -329,9 +329,9 @@ class Robot:
             "chunks dropped from the full spool": self.dropped,
             "chunks refused by the server": sender.refused,
         }
-        parts = [f"{self.captured} records captured in {self.chunks} chunks"]
+        parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]
         parts += [f"{count} {what}" for what, count in lost.items() if count]
-        line = ", ".join([*parts, f"{spool.unstored} chunks kept for later"])
+        line = ", ".join([*parts, f"{counted(spool.unstored, 'chunk')} kept for later"])
         if not spool.unstored:
             return f"{line}."
         if sender.refusal is not None:

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from rosbridge_eth.chunk import Chunk, Log, robot_id
 from rosbridge_eth.config import ServerConfig, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config.values import counted
 from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
@@ -265,7 +266,7 @@ def _alarms(report: Report) -> Iterator[str]:
         if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
             yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
     for each in report["dead"]:
-        yield f"ALARM: dead letters, {each['chunks']} chunks of {each['robot']}: {each['why']}"
+        yield f"ALARM: dead letters, {counted(each['chunks'], 'chunk')} of {each['robot']}: {each['why']}"
     days = report.get("operator", {}).get("days_left")
     if days is not None and days < FEW_DAYS:
         yield f"ALARM: the operator's account, from which robots are paid, lasts {days:.1f} days"
@@ -369,7 +370,8 @@ def _show_operator(report: Report) -> Iterator[RenderableType]:
 def _show_robot(report: Report) -> Iterator[RenderableType]:
     kept = "in use by the robot" if report["runs"] else "nothing yet"
     if spool := report["spool"]:
-        kept = f"{spool['chunks']} chunks, {spool['bytes'] >> 10} KiB; the server lacks {spool['unstored']} of them"
+        chunks = counted(spool["chunks"], "chunk")
+        kept = f"{chunks}, {spool['bytes'] >> 10} KiB; the server lacks {spool['unstored']} of them"
         kept += f" and refused {spool['aside']}" if spool["aside"] else ""
     yield table(f"Robot {report['robot']}", ["what", "value"], [
         ("server", report["server"]), ("topics, nodes", ", ".join([*report["topics"], *report["nodes"]])),

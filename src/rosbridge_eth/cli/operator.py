@@ -15,6 +15,7 @@ import typer
 from rosbridge_eth import status, terminal
 from rosbridge_eth.bundle import Request
 from rosbridge_eth.config import load_server_config
+from rosbridge_eth.config.values import counted
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
@@ -271,7 +272,7 @@ def register(
     if made.unfunded:
         talk(f"It was given no ETH yet ({made.unfunded}); nothing is written for it until the server can give it some.")
     if made.buried:
-        talk(f"{made.buried} chunks of the old {name} are dead letters now; `status` lists them.")
+        talk(f"Dead letters now: {counted(made.buried, 'chunk')} of the old {name}; `status` lists them.")
     talk(f"The CA is {grouped(ca.certificate.fingerprint().hex())}.")
     if request is None:
         talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
@@ -321,7 +322,7 @@ def revoke(
         )  # fmt: skip
     talk(f"{role} {name} is revoked" + (f", on the chain in block {ended.block}." if ended.block is not None else "."))
     if ended.buried:
-        talk(f"{ended.buried} chunks that {name} had handed over are not on the chain; they are dead letters now.")
+        talk(f"Dead letters now: {counted(ended.buried, 'chunk')} that {name} had handed over, not on the chain.")
 
 
 def renew(

@@ -19,7 +19,7 @@ import typer
 
 from rosbridge_eth.config import ReaderConfig, load_reader_config
 from rosbridge_eth.config.models import ArchiveConfig
-from rosbridge_eth.config.values import Address, parse_address, parse_time
+from rosbridge_eth.config.values import Address, counted, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import ReaderHome
@@ -236,7 +236,8 @@ def evidence(
             raise ConfigError("no record was chosen; nothing is written")
         made = making.make(reading, records)
     write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
-    talk(f"{file}: {len(made.records):,} records, for `verify {file} --ca ca.crt.pem`; who has it can read them")
+    what = counted(len(made.records), "record")
+    talk(f"{file}: {what}, for `verify {file} --ca ca.crt.pem`; who has it can read what it shows")
     _require_sound(place, robot, said)
 
 
@@ -310,8 +311,7 @@ def grant(
             now=now,
         )  # fmt: skip
     write_atomically(out, made, new=True)
-    chunks = f"{len(keys):,} chunk{'s' * (len(keys) > 1)}"
-    talk(f"{out} opens {chunks} of {robot} for reader {peer.name}, and for nobody else.")
+    talk(f"{out} opens {counted(len(keys), 'chunk')} of {robot} for reader {peer.name}, and for nobody else.")
     talk(f"Whoever has {peer.name}'s home puts it into `grants/` there and runs: rosbridge-eth read {robot}")
     _require_sound(place, robot, said)
 

@@ -91,6 +91,10 @@ def parse_address(value: Any) -> Address:
     return Address(match[1].strip("[]"), int(match[2]))
 
 
+def counted(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
 def duration_text(seconds: float) -> str:
     """As a person writes it."""
     units = ((86_400, "d"), (3600, "h"), (60, "m"), (1, "s"))

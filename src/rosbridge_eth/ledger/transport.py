@@ -267,7 +267,8 @@ class Node:
         except Web3RPCError as error:
             raise self._error((error.rpc_response or {}).get("error", str(error))) from error
         except requests.RequestException as error:
-            raise ChainUnavailable(f"{self.url} does not answer: {_reason(error)}") from error
+            why = f"{self.url} does not answer ({_reason(error)}); start that node, or name another"
+            raise ChainUnavailable(why) from error
         except Exception as error:  # a stranger's words went through five libraries, each with errors of its own
             words = printable(error) or type(error).__name__
             raise ChainUnavailable(f"{self.url} gave an answer that cannot be used: {words}") from error
@@ -305,7 +306,8 @@ def _reason(error: requests.RequestException) -> str:
     if isinstance(error, requests.HTTPError) and error.response is not None:
         return f"HTTP {error.response.status_code} {printable(error.response.reason, 60)}".strip()
     words = printable(error, 1000)
-    return "too slow" if "timed out" in words else words.rsplit(": ", 1)[-1].rstrip("')\"")
+    last = words.rsplit(": ", 1)[-1].rstrip("')\"")
+    return "too slow" if "timed out" in words else re.sub(r"^\[Errno -?\d+\] ", "", last)
 
 
 def natural(value: Any, end: int = 2**63) -> int:

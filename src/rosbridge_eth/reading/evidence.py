@@ -29,12 +29,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.chunk import Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id
-from rosbridge_eth.config.values import time_text
+from rosbridge_eth.config.values import counted, time_text
 from rosbridge_eth.errors import ChainError, ConfigError, StoreError, VerificationError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import proofs as chain
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.reading.verdict import Governing, counted, grouped, printable, shown
+from rosbridge_eth.reading.verdict import Governing, grouped, printable, shown
 from rosbridge_eth.reading.verify import LAST_MOMENT, ProvenRecord, Verifier
 from smcrypto import sm3, x509
 
@@ -124,8 +124,8 @@ class Evidence(_Part):
             evidence = Evidence.model_validate_json(text)
         except ValidationError as error:
             what = error.errors(include_url=False)[0]
-            where = " ".join(map(str, what["loc"])) or "all of it"
-            raise VerificationError(f"this file is no evidence: {shown(where)}: {shown(what['msg'])}") from None
+            why = ": ".join(filter(None, (" ".join(map(str, what["loc"])), what["msg"])))
+            raise VerificationError(f"this file is no evidence: {shown(why)}") from None
         except UnicodeDecodeError:
             raise VerificationError("this file is no evidence: it is not even text") from None
         if evidence.encode() != text.strip():

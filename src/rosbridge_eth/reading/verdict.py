@@ -21,7 +21,7 @@ from pydantic import BaseModel, Field, StringConstraints
 
 from rosbridge_eth.capture import TypeLine
 from rosbridge_eth.chunk import Log
-from rosbridge_eth.config.values import duration_text, time_text
+from rosbridge_eth.config.values import counted, duration_text, time_text
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.files import write_atomically
 from smcrypto import sm2
@@ -29,10 +29,6 @@ from smcrypto import sm2
 MAX_FINDINGS: Final = 500
 """Findings kept one by one, notices only among the first half; what is above that is counted by kind."""
 MAX_SHOWN: Final = 120
-
-
-def counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 
 class Kind(Enum):
@@ -55,7 +51,7 @@ class Kind(Enum):
     NEW_CERTIFICATE = "new-certificate", False, "certificate", "not known to this reader: compare its fingerprint"
     NO_GRANT = "no-grant", False, "record", "not for this reader"
     ARCHIVED = "archived", False, "record", "in an archive that was not looked into"
-    CLOCK = "clock", False, "time", "the robot's clock was not right"
+    CLOCK = "clock", False, "time", "the robot's clock may have been wrong"
 
     label: str
     violation: bool

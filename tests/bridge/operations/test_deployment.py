@@ -61,7 +61,8 @@ def test_the_container_runs_a_command_that_exists_as_nobody_special_and_holds_no
     command = re.findall(r"^CMD (\[.*\])$", final, re.MULTILINE)[-1]
     parse(re.findall(r'"([^"]*)"', command))
     copied = re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE)
-    assert sorted(" ".join(copied).split()) == ["LICENSE", "README.md", "pyproject.toml", "src"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert {*" ".join(copied).split()} == {"pyproject.toml", "src", project["readme"], *project["license-files"]}
 
 
 def test_the_page_describes_every_metric_there_is():

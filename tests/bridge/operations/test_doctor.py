@@ -77,6 +77,16 @@ def on_chain(place: Place, monkeypatch: Patch) -> None:
     monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
 
 
+def test_what_ends_several_checks_is_told_once(place: Place, capsys: Capture):
+    place.robot.bridge_file.unlink()
+    (place.robot.identity / "ca.crt.pem").unlink()  # the bundle brings it
+    code, findings = doctor(capsys, "--home", "robot")
+    assert code == ExitCode.FAILED and broken(findings) == ["configuration", "source"]  # no ROS here
+    place.robot.config.write_text('topcs = ["/odom"]\n')
+    code, findings = doctor(capsys, "--home", "robot")
+    assert ["topcs" in finding["found"] for finding in findings].count(True) == 1
+
+
 def test_a_robot_that_can_reach_its_server_is_sound(place: Place, server: Address, capsys: Capture):
     code, findings = doctor(capsys, "--home", "robot", "--passphrase-file", "word")
     assert code == 0, findings
