@@ -4,15 +4,15 @@ With a comb, verifying and encrypting take a fifth to a quarter of the time, but
 one costs as much as several verifications: 3.5 ms for a narrow one, 10 ms for a wide one. So
 a key earns them by being used. Only what succeeded counts, so that nobody
 makes us build tables for keys that sign nothing. The least recently used go first, and only
-for a key that was used for longer than its comb costs, and met again sooner: where more keys
-take turns than there is room for, those that have a comb keep it, and no time goes into combs
-that are gone before they are used.
+for a key that was used more often since than its comb costs: where more keys come than there is
+room for, in turn or at random, those that have a comb keep it, and no time goes into combs that
+are gone before they have paid. A wider comb takes nobody's place.
 """
 
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Sequence
 from threading import Lock
 from typing import Final, TypeAlias
@@ -23,27 +23,27 @@ from smcrypto.sm2.points import Comb
 __all__ = ["KnownKeys", "known_keys"]
 
 _Key: TypeAlias = tuple[Curve, Point]
-_TAKES_A_PLACE: Final = 16  # uses from which on a key's comb may take the place of another key's
+_TAKES_A_PLACE: Final = 16  # uses since another key's last one, from which on a key's comb may take the other's place
 
 
 class _Record:
-    """What is known of one key: its uses and when the last was, the comb, the width of the comb that was last begun."""
+    """What is known of one key: its uses, when the last were, its comb, the width of the comb that was last begun."""
 
-    __slots__ = ("comb", "last", "uses", "width")
+    __slots__ = ("comb", "recent", "uses", "width")
 
     def __init__(self) -> None:
         self.comb: Comb | None = None
-        self.uses = self.last = 0
-        self.width = 0
+        self.recent: deque[int] = deque(maxlen=_TAKES_A_PLACE)
+        self.uses = self.width = 0
 
 
 class KnownKeys:
     """Counts uses of public keys and keeps combs for some of them. Safe to use from several threads.
 
-    stages: (uses, width): from so many successful uses on, a comb of that width; ascending.
+    stages: (uses, width): from so many successful uses on, a comb of that width; ascending, one after the other.
     points: that all combs have together, 0.15 kB each. On SM2's curve a comb of width 5 has 1,664, one of width 8 has
     8,192: so 157 keys have the narrow one, or 32 the wide one, in 40 MB.
-    candidates: so many keys that have none are counted.
+    candidates: so many keys that have none are counted, in 1.5 kB each.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class KnownKeys:
                 return None
             if record.comb is not None:
                 self._known.move_to_end(key)
-            due = max((width for uses, width in self._stages if record.uses >= uses), default=0)
-            if record.width >= due or not self._may_build(record, -(-curve.n.bit_length() // due) << due):
+            due = next((width for uses, width in self._stages if width > record.width and record.uses >= uses), 0)
+            if not due or not self._may_build(record, -(-curve.n.bit_length() // due) << due):
                 return record.comb
             record.width = due
         comb = Comb(P, due, curve)
@@ -88,11 +88,11 @@ class KnownKeys:
         return comb
 
     def _may_build(self, record: _Record, points: int) -> bool:
-        """Whether there is room, or (for a first comb) this key was used often, and some key with a comb not since."""
+        """Whether there is room, or (for a first comb) this key was used often since some key with a comb last was."""
         if not self._known or self._points + points <= self._limits[0]:
             return True
         oldest = next(iter(self._known.values()))
-        return record.comb is None and record.uses >= _TAKES_A_PLACE and record.last > oldest.last
+        return record.comb is None and len(record.recent) == _TAKES_A_PLACE and record.recent[0] > oldest.recent[-1]
 
     def used(self, curve: Curve, P: Point) -> None:
         """Count one use of P that succeeded."""
@@ -106,7 +106,7 @@ class KnownKeys:
                     self._candidates.popitem(last=False)
             record.uses += 1
             self._clock += 1
-            record.last = self._clock
+            record.recent.append(self._clock)
 
 
 def _points(comb: Comb | None) -> int:

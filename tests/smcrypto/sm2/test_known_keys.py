@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -109,6 +110,32 @@ def test_keys_that_take_turns_do_not_take_each_others_combs():
     use(memory, POINTS[30], 16)  # this one comes back at once, and theirs was a round ago
     assert memory.comb(TINY_1009, POINTS[30]) is not None
     assert memory.comb(TINY_1009, POINTS[0]) is None
+
+
+def test_keys_that_are_met_at_random_do_not_take_each_others_combs(monkeypatch):
+    memory = KnownKeys(stages=((2, 3),), points=3 * WIDTH_3)
+    built = []
+    monkeypatch.setattr(module, "Comb", lambda *arguments: built.append(arguments) or Comb(*arguments))
+    source = random.Random(1)
+    for P in source.choices(POINTS[:20], k=2000):
+        memory.comb(TINY_1009, P)
+        use(memory, P, 1)
+    assert 3 <= len(built) <= 6
+    for _ in range(20):  # the others stay away, and these three need their places
+        for P in POINTS[30:33]:
+            memory.comb(TINY_1009, P)
+            use(memory, P, 1)
+    assert {P for _, P in memory._known} == {*POINTS[30:33]}
+
+
+def test_a_key_that_takes_a_place_begins_with_a_narrow_comb():
+    memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
+    for P in POINTS[:3]:
+        use(memory, P, 1)
+        memory.comb(TINY_1009, P)
+    use(memory, POINTS[3], 99)
+    assert memory.comb(TINY_1009, POINTS[3]).width == 3
+    assert [P for _, P in memory._known] == POINTS[1:4]
 
 
 def test_a_wider_comb_takes_nobody_elses_place():
