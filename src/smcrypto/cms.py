@@ -148,13 +148,9 @@ class _Trust(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        roots: Iterable[Certificate] | None,
-        at: datetime,
-        intermediates: Iterable[Certificate],
-        crls: Iterable[CertificateRevocationList],
-        uid: BytesLike,
-    ) -> _Trust:
+        cls, roots: Iterable[Certificate] | None, at: datetime, intermediates: Iterable[Certificate],
+        crls: Iterable[CertificateRevocationList], uid: BytesLike,
+    ) -> _Trust:  # fmt: skip
         trusted = None if roots is None else tuple(roots)
         return cls(trusted, instant(at, "at"), tuple(intermediates), tuple(crls), as_bytes(uid, "uid"))
 

@@ -72,15 +72,8 @@ def verify_chain(
         require_type(certificate, Certificate, name)
     for crl in crls:
         require_type(crl, CertificateRevocationList, "each of crls")
-    search = _Search(
-        intermediates,
-        roots,
-        instant(at, "at"),
-        as_bytes(uid, "uid"),
-        _names(extended_key_usage),
-        crls,
-        revocation == "every",
-    )
+    search = _Search(intermediates, roots, instant(at, "at"), as_bytes(uid, "uid"), _names(extended_key_usage), crls,
+                     revocation == "every")  # fmt: skip
     usages = ext.usage_names(_names(key_usage))
     if leaf.key_usage is not None and not usages <= leaf.key_usage:
         raise CertificateError(f"{leaf.subject} may not be used for {', '.join(sorted(usages - leaf.key_usage))}")
@@ -104,15 +97,9 @@ class _Search:
     """One depth-first search; keeps the refusal that came furthest, which is the one worth telling."""
 
     def __init__(
-        self,
-        intermediates: tuple[Certificate, ...],
-        roots: tuple[Certificate, ...],
-        at: datetime,
-        uid: bytes,
-        purposes: tuple[str, ...],
-        crls: tuple[CertificateRevocationList, ...],
-        every: bool,
-    ) -> None:
+        self, intermediates: tuple[Certificate, ...], roots: tuple[Certificate, ...], at: datetime, uid: bytes,
+        purposes: tuple[str, ...], crls: tuple[CertificateRevocationList, ...], every: bool,
+    ) -> None:  # fmt: skip
         self.roots = frozenset(roots)
         self.issuers: dict[Name, list[Certificate]] = {}
         for certificate in dict.fromkeys(roots + intermediates):

@@ -42,16 +42,9 @@ EXTENDED_KEY_USAGE: Final = "2.5.29.37"
 
 # Bits of KeyUsage, 4.2.1.3. X.509 now calls bit 1 contentCommitment.
 _KEY_USAGES: Final = (
-    "digitalSignature",
-    "nonRepudiation",
-    "keyEncipherment",
-    "dataEncipherment",
-    "keyAgreement",
-    "keyCertSign",
-    "cRLSign",
-    "encipherOnly",
-    "decipherOnly",
-)
+    "digitalSignature", "nonRepudiation", "keyEncipherment", "dataEncipherment", "keyAgreement", "keyCertSign",
+    "cRLSign", "encipherOnly", "decipherOnly",
+)  # fmt: skip
 _KEY_USAGE_BITS: Final = {name: bit for bit, name in enumerate(_KEY_USAGES)} | {"contentCommitment": 1}
 
 # Key purposes, 4.2.1.12.

@@ -71,20 +71,12 @@ def issue(
     if not csr.verified:
         csr.verify(uid=requester_uid)
     return _certificate(
-        issuer=ca_certificate.subject,
-        authority=ca_certificate.subject_key_identifier,
-        subject=csr.subject if subject is None else Name.build(subject),
-        public_key=csr.public_key,
-        key=ca_key,
-        uid=signer_uid,
-        validity=_validity(not_before, not_after),
-        serial_number=serial_number,
-        basic=ext.basic_constraints(ca, path_length),
-        usages=_usages(key_usage, ca),
-        purposes=extended_key_usage,
-        alt_names=subject_alt_names,
-        further=extensions,
-    )
+        issuer=ca_certificate.subject, authority=ca_certificate.subject_key_identifier,
+        subject=csr.subject if subject is None else Name.build(subject), public_key=csr.public_key,
+        key=ca_key, uid=signer_uid, validity=_validity(not_before, not_after), serial_number=serial_number,
+        basic=ext.basic_constraints(ca, path_length), usages=_usages(key_usage, ca), purposes=extended_key_usage,
+        alt_names=subject_alt_names, further=extensions,
+    )  # fmt: skip
 
 
 def self_signed(
@@ -106,38 +98,18 @@ def self_signed(
     require_type(key, sm2.PrivateKey, "key")
     name = Name.build(subject)
     return _certificate(
-        issuer=name,
-        authority=ext.key_identifier(key.public_key.to_bytes()),
-        subject=name,
-        public_key=key.public_key,
-        key=key,
-        uid=as_bytes(uid, "uid"),
-        validity=_validity(not_before, not_after),
-        serial_number=serial_number,
-        basic=ext.basic_constraints(ca, path_length),
-        usages=_usages(key_usage, ca),
-        purposes=extended_key_usage,
-        alt_names=subject_alt_names,
-        further=extensions,
-    )
+        issuer=name, authority=ext.key_identifier(key.public_key.to_bytes()), subject=name, public_key=key.public_key,
+        key=key, uid=as_bytes(uid, "uid"), validity=_validity(not_before, not_after), serial_number=serial_number,
+        basic=ext.basic_constraints(ca, path_length), usages=_usages(key_usage, ca), purposes=extended_key_usage,
+        alt_names=subject_alt_names, further=extensions,
+    )  # fmt: skip
 
 
 def _certificate(
-    *,
-    issuer: Name,
-    authority: bytes | None,
-    subject: Name,
-    public_key: sm2.PublicKey,
-    key: sm2.PrivateKey,
-    uid: bytes,
-    validity: bytes,
-    serial_number: int | None,
-    basic: ext.Extension,
-    usages: Iterable[str],
-    purposes: Iterable[str],
-    alt_names: Iterable[str],
-    further: Iterable[ext.Extension],
-) -> Certificate:
+    *, issuer: Name, authority: bytes | None, subject: Name, public_key: sm2.PublicKey, key: sm2.PrivateKey, uid: bytes,
+    validity: bytes, serial_number: int | None, basic: ext.Extension, usages: Iterable[str], purposes: Iterable[str],
+    alt_names: Iterable[str], further: Iterable[ext.Extension],
+) -> Certificate:  # fmt: skip
     if not issuer:
         raise InvalidOption("the issuer's name must not be empty (RFC 5280, 4.1.2.4)")
     wanted = ext.requested(subject, alt_names, usages, purposes)

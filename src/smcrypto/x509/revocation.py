@@ -187,13 +187,9 @@ def _write_entry(entry: RevokedCertificate) -> bytes:
 
 
 def check_revocation(
-    path: Sequence[Certificate],
-    crls: Sequence[CertificateRevocationList],
-    at: datetime,
-    verify: Callable[[CertificateRevocationList, Certificate], None],
-    *,
-    every: bool,
-) -> None:
+    path: Sequence[Certificate], crls: Sequence[CertificateRevocationList], at: datetime,
+    verify: Callable[[CertificateRevocationList, Certificate], None], *, every: bool,
+) -> None:  # fmt: skip
     """CertificateError if a certificate of `path` (leaf first, root last) is revoked, or that cannot be known.
 
     The leaf needs a fresh list of its issuer; with `every` so does each
