@@ -15,6 +15,7 @@ import typer.main
 from rosbridge_eth.cli import app
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.metrics import REGISTRY, reference
+from rosbridge_eth.sources.ros1.source import MAX_CONNECTIONS
 
 ROOT = Path(__file__).resolve().parents[3]
 UNITS = sorted((ROOT / "deploy/systemd").glob("*.service"))
@@ -51,6 +52,13 @@ def test_a_unit_starts_a_command_that_exists_with_the_credential_it_looks_for(un
     kept_down = {int(code) for code in re.findall(r"^RestartPreventExitStatus=(.*)$", text, re.MULTILINE)[0].split()}
     assert kept_down == {ExitCode.USAGE, ExitCode.CONFIG, ExitCode.IDENTITY}
     assert "Type=notify" in text and re.search(r"^WatchdogSec=\d+$", text, re.MULTILINE)
+
+
+def test_a_robots_unit_waits_for_no_network_and_leaves_room_for_every_publisher():
+    [unit] = [path for path in UNITS if path.stem.endswith("robot")]
+    settings = dict(re.findall(r"^(\w+)=(.*)$", unit.read_text(), re.MULTILINE))
+    assert settings["After"] == "network.target" and "Wants" not in settings
+    assert int(settings["TasksMax"]) >= MAX_CONNECTIONS + 64
 
 
 def test_the_container_runs_a_command_that_exists_as_nobody_special_and_holds_no_secret():
