@@ -169,9 +169,10 @@ def take_up(home: RobotHome) -> str | None:
     try:
         fingerprint = join(home, read_bundle(home.answer.read_bytes()))
     except (BridgeError, OSError) as error:
+        said = f"{home.answer} is not taken up: {error}"
         if not home.bridge_file.exists():
-            raise
-        log.error("%s is not taken up: %s", home.answer, error)
+            raise IdentityError(said) from error
+        log.error("%s", said)
         return None
     home.answer.unlink()
     return fingerprint

@@ -282,7 +282,7 @@ class RobotHome:
         """The latest time (seconds since 1970) a server proved to this robot; 0 where there is none."""
         try:
             seconds = float(self.clock.read_text())
-        except (FileNotFoundError, ValueError):
+        except (OSError, ValueError):
             return 0.0
         return seconds if 0 <= seconds < _LATEST else 0.0
 

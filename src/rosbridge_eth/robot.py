@@ -324,7 +324,8 @@ class Robot:
             "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
             "records that there was no memory for until their event": self.box.lost.total(),
-            "messages lost, since the spool took nothing": len(self._ring) + len(self.box.released),
+            "messages lost, since the spool took nothing":
+                len(self._ring) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
             "chunks dropped from the full spool": self.dropped,
             "chunks refused by the server": sender.refused,

@@ -277,7 +277,8 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
         *map(Text, kept),
         Text(
             f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
-            f" {spool.chunks - spool.unstored} for the chain, {sender.confirmed} confirmed{where}. Session: {session}.",
+            f" {spool.chunks - spool.unstored - spool.aside} for the chain, {sender.confirmed} confirmed{where}."
+            f" Session: {session}.",
             no_wrap=False, overflow="fold",  # why there is no session is longer than a line
         ),
     )

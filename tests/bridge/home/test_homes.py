@@ -24,6 +24,11 @@ from rosbridge_eth.home import (
 DEPLOYMENT = Deployment(31337, "0x" + "11" * 32, "0x" + "aB" * 20, 7)
 
 
+def test_a_clock_that_cannot_be_read_is_none(tmp_path: Path) -> None:
+    (tmp_path / "clock").mkdir()
+    assert RobotHome(tmp_path).clock_floor() == 0.0
+
+
 @pytest.mark.parametrize("kind", HomeKind)
 def test_a_home_says_whose_it_is_and_no_other_command_takes_it(kind: HomeKind, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="nobody's home; `init --home`"):

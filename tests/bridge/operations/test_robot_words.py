@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 import socket
@@ -11,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from bridge import disks
 from bridge.lone_robot import CA, NOW, READER, lone_robot
@@ -19,6 +21,7 @@ from rosbridge_eth import metrics
 from rosbridge_eth import robot as module
 from rosbridge_eth.channel import ClientConfig, Connected, HandshakeFailed, Reason
 from rosbridge_eth.chunk import MAX_READERS
+from rosbridge_eth.cli.robot import _picture
 from rosbridge_eth.config import Address, load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.registry import Registry
@@ -62,6 +65,17 @@ def test_a_reason_is_said_with_its_mend_and_at_most_once_a_minute(place: Place, 
     assert [sum(why in line for line in said) for why in ("it is silent", "it refuses")] == [3, 3]
     assert all("register --replace" in line and "join" in line for line in said if "it refuses" in line)
     assert all('channel = "exchange"' in line for line in said if "it is silent" in line)
+
+
+def test_the_picture_does_not_count_what_was_refused_among_what_waits_for_the_chain(place: Place) -> None:
+    robot = opened(place, NO_SERVER + ODOM + BAG)
+    with closing(robot.spool), closing(robot.loop):
+        for chunk in robot.writer.finish(0):
+            robot.spool.append(chunk)
+            robot.spool.set_aside(robot.writer.stream, chunk.header.number)
+        shown = Console(width=200, file=(out := io.StringIO()))
+        shown.print(_picture("robot_1", robot, metrics.Rates()))
+        assert "0 wait for the server, 0 for the chain, 0 confirmed" in out.getvalue()
 
 
 def test_a_disk_that_is_full_when_a_session_begins_does_not_end_a_robot(tmp_path: Path, caplog: Logged) -> None:
