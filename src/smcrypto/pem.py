@@ -43,8 +43,12 @@ def encode(label: str, der: bytes) -> bytes:
     return b"\n".join([b"-----BEGIN " + name + b"-----", *lines, b"-----END " + name + b"-----", b""])
 
 
-def decode(data: BytesLike) -> list[Block]:
-    """Every block of `data`, in order; none where there is none. InvalidEncoding for a malformed block."""
+def decode(data: BytesLike, labels: Iterable[str] | None = None) -> list[Block]:
+    """Every block of `data`, in order; none where there is none. InvalidEncoding for a malformed block.
+
+    labels: only blocks with one of them; what is inside the others is not looked at.
+    """
+    wanted = None if labels is None else tuple(labels)
     blocks: list[Block] = []
     label: bytes | None = None
     body: list[bytes] = []
@@ -58,7 +62,8 @@ def decode(data: BytesLike) -> list[Block]:
         elif match is None:
             body.append(line.strip(b" \t"))
         elif match[1] == b"END" and match[2] == label:
-            blocks.append(Block(label.decode("ascii"), _unarmoured(body)))
+            if wanted is None or label.decode("ascii") in wanted:
+                blocks.append(Block(label.decode("ascii"), _unarmoured(body)))
             label = None
         else:
             raise InvalidEncoding("a PEM block does not end with the END line of its label")
@@ -70,9 +75,8 @@ def decode(data: BytesLike) -> list[Block]:
 def first(data: BytesLike, labels: Iterable[str]) -> Block:
     """The first block with one of `labels`; InvalidEncoding, naming the labels, where there is none."""
     wanted = tuple(labels)
-    for block in decode(data):
-        if block.label in wanted:
-            return block
+    for block in decode(data, wanted):
+        return block
     raise InvalidEncoding(f"no PEM block labelled {' or '.join(wanted)}")
 
 

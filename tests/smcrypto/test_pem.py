@@ -80,6 +80,16 @@ def test_a_line_that_is_nearly_a_boundary_costs_no_memory() -> None:
     assert peak < 5 * len(line)
 
 
+def test_what_is_in_blocks_of_other_labels_is_not_looked_at() -> None:
+    """As beside a certificate, a key under OpenSSL's old encryption."""
+    other = BLOCK.replace(b"CERTIFICATE", b"EC PRIVATE KEY").replace(b"AAEC", b"Proc-Type: 4,ENCRYPTED\n\nAAEC")
+    assert pem.first(other + BLOCK, ["CERTIFICATE"]) == pem.decode(BLOCK)[0]
+    assert pem.decode(other + BLOCK + other + BLOCK, ["CERTIFICATE"]) == pem.decode(BLOCK + BLOCK)
+    for labels in (None, ["EC PRIVATE KEY"]):
+        with pytest.raises(InvalidEncoding, match="RFC 1421"):
+            pem.decode(other + BLOCK, labels)
+
+
 def test_no_block_of_the_label() -> None:
     with pytest.raises(InvalidEncoding, match="no PEM block labelled PUBLIC KEY or PRIVATE KEY"):
         pem.first(BLOCK, ["PUBLIC KEY", "PRIVATE KEY"])

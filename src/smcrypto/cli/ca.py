@@ -271,18 +271,16 @@ def _moment(text: str | None) -> datetime:
 
 
 def run_show(options: argparse.Namespace) -> int:
-    shown = 0
-    for label, content in pem.decode(read_all(options.file)):
-        if label in x509.Certificate.LABELS:
+    certificates, requests = x509.Certificate.LABELS, x509.CertificateSigningRequest.LABELS
+    blocks = pem.decode(read_all(options.file), certificates + requests + x509.CertificateRevocationList.LABELS)
+    for label, content in blocks:
+        if label in certificates:
             print(_describe_certificate(x509.Certificate.from_der(content)))
-        elif label in x509.CertificateSigningRequest.LABELS:
+        elif label in requests:
             print(_describe_request(x509.CertificateSigningRequest.from_der(content)))
-        elif label in x509.CertificateRevocationList.LABELS:
-            print(_describe_crl(x509.CertificateRevocationList.from_der(content)))
         else:
-            continue
-        shown += 1
-    if not shown:
+            print(_describe_crl(x509.CertificateRevocationList.from_der(content)))
+    if not blocks:
         raise CertificateError("no certificate, request or revocation list in PEM (`diagnose` reads DER as well)")
     return 0
 

@@ -105,8 +105,8 @@ class Certificate(Signed):
 def load_pem_certificates(data: BytesLike) -> tuple[Certificate, ...]:
     """Every certificate of a PEM bundle, in order; CertificateError where there is none."""
     with parsing("certificate bundle"):
-        blocks = pem.decode(as_bytes(data, "data"))
-    found = tuple(Certificate.from_der(block.der) for block in blocks if block.label in Certificate.LABELS)
+        blocks = pem.decode(as_bytes(data, "data"), Certificate.LABELS)
+    found = tuple(Certificate.from_der(block.der) for block in blocks)
     if not found:
         raise CertificateError("no certificate in the PEM data")
     return found
