@@ -9,6 +9,7 @@ too.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import socket
@@ -154,9 +155,12 @@ def collected(home: Path | None = None) -> CollectorRegistry:
 
 
 def figures(home: Path) -> list[tuple[str, dict[str, str], float]]:
-    """Name (without its prefix), labels and value of all that the process of that home shows; ValueError, as above."""
+    """Name (without its prefix), labels and value of all that the process of that home shows; ValueError, as above.
+
+    A figure of what is no more is NaN, and left out."""
     samples = [sample for family in collected(home).collect() for sample in family.samples]
-    return [(sample.name.removeprefix("rosbridge_eth_"), sample.labels, sample.value) for sample in samples]
+    return [(sample.name.removeprefix("rosbridge_eth_"), sample.labels, sample.value) for sample in samples
+            if not math.isnan(sample.value)]  # fmt: skip
 
 
 class Rates:
@@ -341,6 +345,9 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     beat("robot", wall)
     show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
     CAPTURED.labels(name).set(robot.captured)
+    for gone in {trigger for _, trigger in FIRED._metrics} - robot.box.triggers.keys():  # by a reload
+        for gauge in (FIRED, KEPT, KEPT_BYTES):
+            gauge.labels(name, gone).set(math.nan)
     for trigger in robot.box.triggers.values():
         FIRED.labels(name, trigger.rule.name).set(trigger.fired)
         KEPT.labels(name, trigger.rule.name).set(len(trigger.ring))

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bridge.lone_robot import PASSWORD, chunks_of, command, environment, lines_of, lone_robot
+from bridge.lone_robot import PASSWORD, READER, chunks_of, command, environment, lines_of, lone_robot
 from bridge.sources.ros1.graph import Graph, eventually
 from rosbridge_eth import metrics
 from rosbridge_eth.cli import run
@@ -251,6 +251,20 @@ rate = 50
     times = [line["received_ns"] for line in lines if line.get("topic") == "/robot_1/odom"]
     assert times == sorted(set(times)), "nothing twice, in order"
     assert "trigger near (SIGUSR1): " in log.read_text()
+
+
+def test_a_trigger_that_is_gone_after_a_reload_has_no_figures(robot: RobotHome):
+    one = '[source]\nkind = "sim"\n[[trigger]]\nname = "crash"\n'
+    topics = 'topics = [{topic = "/robot_1/odom", trigger = "crash"}, {topic = "/robot_1/imu", trigger = "NAME"}]\n'
+    robot.config.write_text(f'{topics.replace("NAME", "fall")}{one}[[trigger]]\nname = "fall"\n')
+    made = open_robot(robot, load_robot_config(robot.config), PASSWORD)
+    with closing(made.spool), closing(made.loop), metrics.shared(robot.path):
+        metrics.show_robot("robot_1", made, 1.0)
+        robot.config.write_text(topics.replace("NAME", "crash") + one)
+        made.take_up(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
+        metrics.show_robot("robot_1", made, 2.0)
+        named = {labels["trigger"] for _, labels, _ in metrics.figures(robot.path) if "trigger" in labels}
+    assert named == {"crash"}, "`trigger` asks for those that there are"
 
 
 def test_a_robot_without_a_trigger_is_not_ended_by_the_signal(robot: RobotHome, tmp_path: Path):
