@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import logging
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 
 from pydantic import TypeAdapter
@@ -142,7 +142,10 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
         peer.signing_certificate.to_der(), peer.encryption_certificate.to_der(), role=ids.Role.ROBOT,
         name=bundle.end.robot, at=peer.not_before,
     )  # fmt: skip
-    if home.bridge_file.exists() and home.bridge().ledger != bundle.end.ledger:
+    known = None
+    with suppress(ConfigError):  # absent, or damaged, which joining again mends
+        known = home.bridge().ledger
+    if known not in (None, bundle.end.ledger):
         raise ConfigError(f"{home.path} writes to another ledger already; choose another folder")
     with new_home(home.path) if bundle.keys else nullcontext():
         _make_folders(home)
@@ -164,7 +167,7 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
 def take_up(home: RobotHome) -> str | None:
     """Join with the bundle that was put into the home (RobotHome.answer), which then goes; the CA's fingerprint, or
     None where there is none. A robot that has joined goes on as it is where that fails."""
-    if not home.request.exists() or not home.answer.exists():
+    if not home.answer.exists():
         return None
     try:
         fingerprint = join(home, read_bundle(home.answer.read_bytes()))

@@ -260,7 +260,10 @@ class RobotHome:
     @property
     def answer(self) -> Path:
         """Where the bundle that answers the request is put, for `robot` to take up."""
-        return self.path / f"{home_of(self.path, HomeKind.ROBOT)['name']}.bundle"
+        return self.path / f"{self._head()['name']}.bundle"
+
+    def _head(self) -> dict[str, Any]:
+        return home_of(self.path, HomeKind.ROBOT, f"run `join --name NAME --home {self.path}` first")
 
     def event(self, trigger: str) -> Path:
         """The file that asks for it."""
@@ -271,7 +274,7 @@ class RobotHome:
 
     def bridge(self) -> BridgeEnd:
         """ConfigError where this is no robot's home, or it has not had its bundle yet."""
-        home_of(self.path, HomeKind.ROBOT, f"run `join --name NAME --home {self.path}` first")
+        self._head()
         absent = ConfigError(
             f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
             f" a bundle; put that into {self.path} and run `robot --home {self.path}`"

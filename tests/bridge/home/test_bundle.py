@@ -226,6 +226,28 @@ def test_a_bundle_that_cannot_be_taken_up_ends_no_robot_that_has_joined(
     assert take_up(home) is not None
 
 
+def test_a_damaged_bridge_file_is_mended_by_joining_again_as_its_error_says(home: RobotHome) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    join(home, bundle)
+    home.bridge_file.write_text('{"robot": "robot_1"')
+    with pytest.raises(ConfigError, match="join again"):
+        home.bridge()
+    home.answer.write_bytes(bundle.encode())
+    assert take_up(home) is not None and home.bridge() == END
+
+
+def test_a_bundle_that_answers_no_request_is_not_passed_over_without_a_word(
+    home: RobotHome, caplog: pytest.LogCaptureFixture
+) -> None:
+    bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
+    join(home, bundle)
+    home.request.unlink()
+    home.answer.write_bytes(bundle.encode())
+    assert take_up(home) is None and "has made no request that this bundle could answer" in caplog.text
+    with pytest.raises(ConfigError, match="run `join --name NAME"):
+        take_up(RobotHome(home.path.parent))
+
+
 def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_crash_fell(
     home: RobotHome, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
