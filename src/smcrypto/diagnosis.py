@@ -109,7 +109,7 @@ def diagnose(
     """
     octets = data.encode("utf-8", "replace") if isinstance(data, str) else as_bytes(data, "data")
     if len(octets) > MAX_SIZE:
-        raise InvalidLength(f"what is to be diagnosed is at most {MAX_SIZE} bytes, not {len(octets)}")
+        raise InvalidLength(f"what is to be diagnosed is at most {MAX_SIZE} bytes")
     if not (key is None or isinstance(key, sm2.PrivateKey | sm2.PublicKey)):
         raise TypeError(f"key must be a PrivateKey or a PublicKey, not {type(key).__name__}")
     uids = (sm2.DEFAULT_UID, b"") if uid is None else (as_bytes(uid, "uid"), sm2.DEFAULT_UID, b"")
