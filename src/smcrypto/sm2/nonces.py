@@ -10,7 +10,8 @@ KDF being the standard's (SM3 in counter mode, 512 bits, so that the bias of the
 reduction is below 2^-250), R 32 fresh random bytes, j the number of the attempt.
 While R is good, k is uniform whatever the rest. If R is constant, k is a function
 of key and message that nobody without the key can evaluate, and differs between
-messages, as in deterministic signing.
+messages, as in deterministic signing. Encryption has no secret to give, and gives
+the public key: with R constant, who guesses a message can make sure that it is this one.
 """
 
 from __future__ import annotations
