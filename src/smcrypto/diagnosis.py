@@ -309,9 +309,15 @@ def _signatures(data: bytes, how: _Written, given: _Given) -> Iterator[Reading]:
             continue
         if not (0 < r < SM2P256V1.n and 0 < s < SM2P256V1.n):
             continue
-        verdict, e = _signature_verdict(r, s, given)
-        yield Reading("signature", f"{'DER, SEQUENCE { r, s }' if encoding == 'der' else '64 bytes, r ‖ s'}, in {how}",
-                      verdict, _signature_calls(r, s, encoding, how, given, e))
+        verdict, found = _signature_verdict(r, s, given)
+        form = f"{'DER, SEQUENCE { r, s }' if encoding == 'der' else '64 bytes, r ‖ s'}, in {how}"
+        if verdict.endswith(_EXCHANGED):  # the calls take them in order
+            r, s = s, r
+            how = how._replace(python=f"bytes.fromhex('{encode_signature(r, s, SM2P256V1, encoding).hex()}')")
+        yield Reading("signature", form, verdict, _signature_calls(r, s, encoding, how, given, found))
+
+
+_EXCHANGED = "; r and s are exchanged"
 
 
 class _Candidate(NamedTuple):
@@ -352,7 +358,7 @@ def _signature_verdict(r: int, s: int, given: _Given) -> tuple[str, _Candidate |
         return "", None
     if given.message is None:
         return "give the message as well, to have it tried on the key", None
-    for first, second, order in ((r, s, ""), (s, r, ", r and s exchanged")):
+    for first, second, order in ((r, s, ""), (s, r, _EXCHANGED)):
         for candidate in _candidates(given, given.public):
             digest = (candidate.e % (1 << 256)).to_bytes(32, "big")
             try:

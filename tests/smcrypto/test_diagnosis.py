@@ -109,14 +109,18 @@ def test_signatures_without_z(e: bytes, story: str) -> None:
 
 
 def test_signatures_of_what_was_not_meant() -> None:
-    def verdict(signature: bytes, message: bytes) -> str:
+    def verdict(signature: bytes | str, message: bytes) -> str:
         return diagnose(signature, key=KEY, message=message).readings[0].verdict
 
     assert verdict(KEY.sign(b"m"), b"m\r\n").endswith("without its last line end")
     assert verdict(KEY.sign(b"\x01\xab"), b"01AB").endswith("of the bytes that the message spells in hex")
     assert verdict(KEY.sign(b"m".hex().encode()), b"m").endswith("of the message's hex digits as text")
     raw = KEY.sign(b"m", encoding="raw")
-    assert verdict(raw[32:] + raw[:32], b"m").endswith("r and s exchanged")
+    exchanged = (raw[32:] + raw[:32]).hex()
+    assert verdict(exchanged, b"m").endswith("; r and s are exchanged")
+    calls = dict(diagnose(exchanged, key=KEY, message=b"m").readings[0].calls)
+    evaluated(calls["smcrypto"], exchanged, key=PUBLIC, message=b"m")
+    assert raw.hex() in calls["gmssl"] and raw.hex() in calls["sm-crypto"]
     assert "does not hold" in verdict(raw, b"")
     assert diagnose(bytes(64)).readings == diagnose(b"\xff" * 64).readings == ()
 
