@@ -22,7 +22,7 @@ VERSION = 2
 _PAGE = 4096  # bytes
 BUSY_TIMEOUT = 10.0  # s that a write waits for those of other processes
 _LARGEST = 1073741823  # pages of a database, SQLite's own limit
-_DAMAGED = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+DAMAGED = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
 _IN_USE = {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
 _BESIDE = ("", "-wal", "-shm")
 
@@ -191,7 +191,7 @@ class Database:
             where, code = f"the {self._what} {self.path}", _code(error)
             if code in _IN_USE:
                 raise InUse(f"{where} is in use by another process; stop that one first") from None
-            if code in _DAMAGED or (opening and code == 0):
+            if code in DAMAGED or (opening and code == 0):
                 raise self._damage(" ".join(str(error).split()), move=opening and self._exclusive) from None
             if code == sqlite3.SQLITE_FULL:
                 raise DiskFull(f"the disk of {where} is full; make room, what was kept before is safe") from None

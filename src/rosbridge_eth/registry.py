@@ -17,6 +17,7 @@ from typing import NamedTuple, Self
 from eth_hash.auto import keccak
 
 from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.database import DAMAGED
 from rosbridge_eth.errors import IdentityError, StoreError
 from rosbridge_eth.identity import PeerIdentity, Role
 
@@ -79,6 +80,8 @@ class Registry:
             self._robots: tuple[tuple[int, int], dict[bytes, Enrolment]] | None = None  # by revision
             begun = set(self._db.execute("SELECT role, name FROM enrolment"))
         except (sqlite3.Error, OSError) as error:
+            if path.exists() and getattr(error, "sqlite_errorcode", 0) & 0xFF not in DAMAGED:
+                raise StoreError(f"the registry {path} cannot be used: {error}; see that you may write it") from error
             raise StoreError(self._lost(f"it cannot be used as a database, {error}")) from error
         if not new and (("reader", OWNER) not in begun or "server" not in {role for role, _ in begun}):
             self.close()

@@ -169,7 +169,7 @@ class Ledger:
         """where: a URL, or a provider of web3 (nodes.embedded). timeout: seconds for one answer."""
         self._node = Node(where, timeout, artifact()["abi"])
         self.url, self._w3 = self._node.url, self._node.w3
-        self._place, self._checked = place, False
+        self._place = place
         with self._node.asking():
             self._contract: Any = self._w3.eth.contract(self._w3.to_checksum_address(contract), abi=artifact()["abi"])
         self.contract: str = self._contract.address
@@ -204,9 +204,7 @@ class Ledger:
         return Ledger(where, receipt.contract), receipt
 
     def check(self) -> None:
-        """ChainError unless the node has this contract, on the chain where it was deployed. Asks the node once."""
-        if self._checked:
-            return
+        """ChainError unless the node has this contract, on the chain where it was deployed."""
         with self._node.asking():
             chain_id = self._w3.eth.chain_id
         here, right = (chain_id, self.block(0).hash), (self.chain_id, self.genesis)
@@ -219,7 +217,6 @@ class Ledger:
             raise ChainError(f"there is no contract at {self.contract} on {self.url}; the node may be behind")
         if code.hex() != artifact()["deployedBytecode"]:
             raise ChainError(f"the contract at {self.contract} on {self.url} is not RobotLedger of this edition")
-        self._checked = True
 
     def close(self) -> None:
         self._node.close()

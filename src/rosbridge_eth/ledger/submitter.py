@@ -146,7 +146,8 @@ class Submitter:
     def turn(self, now: float) -> float:
         """now: seconds since 1970. Seconds until the next turn is wanted. StoreError of the inbox passes through."""
         try:
-            self._ledger.check()
+            if self.head is None or self.trouble is not None:  # whose place another chain may have taken
+                self._ledger.check()
             head = self._ledger.block()
             if head == self.head and 0 <= now - self._looked_at < IDLE:
                 return BUSY

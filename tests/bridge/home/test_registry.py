@@ -100,6 +100,14 @@ def test_a_file_that_is_no_database_is_refused_with_the_way_out(tmp_path: Path) 
         Registry(tmp_path / "registry.sqlite")
 
 
+def test_one_that_cannot_be_opened_is_not_said_to_be_damaged(tmp_path: Path) -> None:
+    """Who puts a backup in its place brings back whom it knew and who was revoked since."""
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StoreError, match="unable to open database file; see that") as caught:
+        Registry(tmp_path / "folder")
+    assert "backup" not in str(caught.value)
+
+
 @pytest.mark.parametrize("harm", ["deleted", "emptied", "made anew", "of another robot"])
 def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry, tmp_path: Path, harm: str) -> None:
     enrol(registry, "robot_1")

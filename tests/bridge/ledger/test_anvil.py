@@ -128,6 +128,17 @@ def test_a_node_that_hangs_is_waited_for(ledger: Ledger, node: Anvil, tmp_path: 
     assert world.submitter.trouble is None
 
 
+def test_a_chain_that_was_made_anew_is_said_to_be_another_one(ledger: Ledger, node: Anvil, tmp_path: Path):
+    world = World(tmp_path, ledger=ledger)
+    assert ledger.genesis == ledger.block(0).hash
+    world.turn()
+    time.sleep(1.1)  # its first block is as old as it is, in seconds
+    node.ask("anvil_reset")
+    for _ in range(2):
+        world.turn()
+    assert "is another chain" in str(world.submitter.trouble)
+
+
 def test_dropped_and_reorganised_transactions_are_sent_again(ledger: Ledger, node: Anvil, tmp_path: Path):
     world = World(tmp_path, ledger=ledger)
     node.ask("evm_setAutomine", False)
