@@ -228,7 +228,9 @@ def demo(
         min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")] = 0.0,
     json: Json = False,
 ) -> None:
-    """Replay a real bag over real UDP onto an Ethereum chain in this process, read it back, prove and compare it.
+    """See it work: a bag onto a chain and back, proven and compared.
+
+    All of it in this process, over real UDP, on a chain that is gone afterwards.
 
     Exits with 9 if a single record is missing, altered or doubled.
     """

@@ -250,7 +250,7 @@ def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Keyring
 
     if secret is None:
-        yield skipped("passphrase", "not tried", "give --passphrase-file")
+        yield skipped("passphrase", "none was given", "give --passphrase-file")
         return
     ids.load_identity(home.server, secret)
     Keyring.load(home.accounts, secret)
@@ -442,7 +442,7 @@ def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
     folder = load_reader_config(home.config).identity
     yield from certificates(folder, "let the operator make this reader anew (`reader NAME --replace`)")
     if secret is None:
-        yield skipped("passphrase", "not tried", "give --passphrase-file")
+        yield skipped("passphrase", "none was given", "give --passphrase-file")
     else:
         identity, _ = ids.load_identity(folder, secret)
         yield ok("passphrase", f"opens the keys of {identity.name}")
@@ -491,7 +491,7 @@ def doctor(
         "--passphrase-file", help="Of this home's keys (a robot's password), to try them.")] = None,
     json: Json = False,
 ) -> None:
-    """Try everything this home depends on, and name the mend for what does not work. An operator's, robot's, reader's.
+    """Try all that a home depends on, and name the mend. An operator's, a robot's, a reader's.
 
     Exits with 1 if something is broken.
     """

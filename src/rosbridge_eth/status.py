@@ -236,8 +236,8 @@ def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolm
     before: dict[bytes, Standing] = {}
     treasury = ledger.balance(operator["account"])
     operator["eth"] = treasury / _WEI
-    with _asking(report, "what robots spend"):
-        block = max(1, head - SPENDING_BLOCKS)
+    block = max(1, head - SPENDING_BLOCKS)
+    with _asking(report, f"how long accounts last, by their balances in block {block}"):
         before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
         seconds = ledger.block_time(head) - ledger.block_time(block)
     for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
@@ -408,7 +408,7 @@ def status(
     follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
     json: Json = False,
 ) -> None:
-    """What is where: robots, what waits and why, dead letters, balances, the last block. Of any home.
+    """Show what is where: robots, what waits, balances, alarms. Of any home.
 
     What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
     another chain than the contract.

@@ -131,7 +131,9 @@ def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Reg
 class Supervisor:
     """Runs a server until `stop`, SIGTERM, SIGINT, or its terminal is gone; SIGHUP: server.toml is read again."""
 
-    def __init__(self, home: OperatorHome, config: Settings, secrets: Secrets) -> None:
+    def __init__(self, home: OperatorHome, config: Settings, secrets: Secrets, workers: int | None = None) -> None:
+        """workers: how many, where that is not to be as in the configuration."""
+        self._workers = workers or config.workers
         self._home, self._config, self._secrets = home, config, secrets
         self._deployment = home.deployment()
         self._children: dict[str, BaseProcess] = {}
@@ -156,7 +158,7 @@ class Supervisor:
         it is started. on_ready: called with the address that is listened on; on_look: after every look at them.
         """
         self._check(self._config)
-        sockets = server_sockets(self._config.listen, self._config.workers)  # a second server gets no further
+        sockets = server_sockets(self._config.listen, self._workers)  # a second server gets no further
         with metrics.shared(self._home.path):
             tasks: dict[str, Callable[[], None]] = {SUBMITTER: self._submit}
             for number, sock in enumerate(sockets):

@@ -206,7 +206,7 @@ def topics(
     home: RobotHomeOption = ROBOT_HOME, source: SourceOption = None,
     seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to listen.")] = 5.0, json: Json = False,
 ) -> None:  # fmt: skip
-    """What there is to capture: topics, types, rates, sizes; what robot.toml takes of it, and what that costs a day.
+    """List what there is to capture, and what it costs a day. With types, rates, sizes, and what robot.toml takes.
 
     Without a robot.toml, everything is taken.
     """

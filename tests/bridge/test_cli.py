@@ -187,6 +187,14 @@ def test_version_and_help_are_there_in_short_and_long(capsys: Capture) -> None:
             assert "Usage" in capsys.readouterr().out
 
 
+def test_the_list_of_commands_says_of_each_a_whole_sentence(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert "Usage: rosbridge-eth [OPTIONS]" in out, "completion is installed for that name"
+    assert "doctor" in out and "..." not in out.replace("[ARGS]...", "")
+
+
 @pytest.mark.service
 def test_a_port_in_use_and_another_chain_are_told(place: Place, require: Callable[[str], str], capsys: Capture) -> None:
     require("npx")

@@ -52,7 +52,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
         try:
-            app(args=None if arguments is None else list(arguments))
+            app(args=None if arguments is None else list(arguments), prog_name="rosbridge-eth")
         finally:
             _flush()
     except BridgeError as error:

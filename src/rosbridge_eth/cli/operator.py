@@ -103,7 +103,7 @@ def up(
     archive: _ArchiveOption = None, passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Everything an operator runs, in one: home, local chain, contract, server. For trying out and for small sites.
+    """Run all of it: an operator's home, chain, contract, server. For trying out and for small sites.
 
     What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
     """
@@ -166,7 +166,7 @@ def up(
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
-        _serve(place, secret, keys, {}, look)
+        _serve(place, secret, keys, None, look)
     talk("Everything is kept: `up` goes on with it.")
 
 
@@ -183,7 +183,10 @@ def init(
     passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Make an operator's home: the CA, the server's identity, the seed of all accounts; and the reader `owner`."""
+    """Make an operator's home, and that of the first reader, `owner`.
+
+    In the operator's are the CA, the server's identity, and the seed of all accounts.
+    """
     from rosbridge_eth.administration import init_home
     from rosbridge_eth.ledger import Keyring
 
@@ -212,7 +215,7 @@ def chain(
         min=0.1, help="Seconds between blocks; without it each transaction gets its own.")] = None,
     eth: Annotated[int, typer.Option(min=1, help="ETH on the operator's account.")] = 1000,
 ) -> None:
-    """Start a local anvil whose chain is kept in the home, and give the operator's account ETH on it."""
+    """Start a local chain, kept in the home; the operator has ETH. It is an anvil, which npx fetches."""
     from rosbridge_eth.ledger.nodes import Anvil
 
     log_to_stderr()
@@ -250,7 +253,7 @@ def register(
     passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     password_file: terminal.PasswordFile = None,
 ) -> None:  # fmt: skip
-    """Register a robot: its request becomes an account on the chain, certificates, and a bundle to carry back.
+    """Register a robot by its request. It gets an account, certificates, a bundle to carry back.
 
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
     """
@@ -292,7 +295,7 @@ def add_reader(
     home: OperatorHomeOption = OPERATOR_HOME, replace: _ReplaceOption = False, passphrase_file: PassphraseFile = None,
     ca_passphrase_file: _CaPassphraseFile = None, reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Make another reader; robots that are registered from now on seal for it too."""
+    """Make another reader. Robots that are registered from now on seal for it too."""
     from rosbridge_eth import administration
 
     place, folder = OperatorHome(home).require(), ReaderHome(to or Path(name))
@@ -311,7 +314,7 @@ def revoke(
     role: Annotated[Role, typer.Option(help="What it is.")] = Role.ROBOT,
     compromised: _CompromisedOption = False, passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Revoke a name: the server closes its session at once, and the chain takes nothing from it any more."""
+    """Revoke a name. The server closes its session at once, and the chain takes nothing from it any more."""
     from rosbridge_eth import administration
 
     place, _, keys = _opened(home, passphrase_file)
@@ -329,7 +332,7 @@ def renew(
     home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     ca_passphrase_file: _CaPassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Give the server new keys and certificates, before the old ones expire; then start the server again."""
+    """Give the server new keys, before the certificates expire. Then start the server again."""
     from rosbridge_eth.administration import renew_server
 
     place = OperatorHome(home).require()
@@ -345,7 +348,7 @@ def export(
     home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     password_file: Annotated[Path | None, typer.Option(help="The keystore's own password.")] = None,
 ) -> None:  # fmt: skip
-    """Write an account as a standard keystore that other Ethereum software imports."""
+    """Write an account as a keystore, for other Ethereum software."""
     from rosbridge_eth.administration import OPERATOR
 
     (place, _, keys), number = _opened(home, passphrase_file), 0
@@ -364,7 +367,7 @@ def export(
 
 
 def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
-    """Print the words from which all accounts can be restored (`init --mnemonic-file`). Keep them offline."""
+    """Print the words from which all accounts can be restored. Keep them offline; `init --mnemonic-file` takes them."""
     typer.echo(_opened(home, passphrase_file)[2].mnemonic)
 
 
@@ -372,7 +375,7 @@ def handover(
     to: Annotated[str | None, typer.Argument(help="The account of the operator's home that takes over.")] = None,
     home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Offer the contract to another operator's account; without an account, take over what is offered to this home's.
+    """Offer the contract to another operator, or take over an offer. The latter without an account.
 
     Until it is taken over nothing changes, and another offer replaces this one. docs/operations.md has all steps.
     """
@@ -393,7 +396,7 @@ def handover(
 def backup(
     target: Annotated[Path, typer.Argument(help="A new folder.")], home: terminal.AnyHomeOption = OPERATOR_HOME
 ) -> None:
-    """Copy a home, in use or not, into a new folder; keep it where its keys are safe."""
+    """Copy a home, in use or not, into a new folder. Keep it where its keys are safe."""
     from rosbridge_eth import administration
 
     administration.backup(home, target)
@@ -419,24 +422,24 @@ def server(
     passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Take chunks from robots and bring them onto the chain, until stopped."""
+    """Take chunks from robots and bring them onto the chain."""
     log_to_stderr(log_format, verbose)
-    _serve(*_opened(home, passphrase_file), {} if workers is None else {"workers": workers})
+    _serve(*_opened(home, passphrase_file), workers)
 
 
 def _serve(
-    place: OperatorHome, passphrase: bytes, keys: Keyring, changes: dict[str, int],
+    place: OperatorHome, passphrase: bytes, keys: Keyring, workers: int | None,
     look: Callable[[], None] = lambda: None,
 ) -> None:  # fmt: skip
-    """Run the server, with these keys of server.toml changed; what `look` raises ends it in good order."""
+    """Run the server, with so many workers, else as server.toml says; what `look` raises ends it in good order."""
     from rosbridge_eth.administration import load_server_identity
     from rosbridge_eth.supervisor import Secrets, Supervisor
 
-    config = load_server_config(place.config).model_copy(update=changes)
+    config = load_server_config(place.config)
     secrets = Secrets(load_server_identity(place, passphrase), keys)
 
     def ready(address: tuple[str, int]) -> None:
-        talk(f"Listening on UDP {address[0]}:{address[1]} (workers: {config.workers}); Ctrl-C ends it.")
+        talk(f"Listening on UDP {address[0]}:{address[1]} (workers: {workers or config.workers}); Ctrl-C ends it.")
 
     with live(lambda: status.fleet(place)) as show:
 
@@ -444,7 +447,7 @@ def _serve(
             show()
             look()
 
-        Supervisor(place, config, secrets).run(ready, on_look)
+        Supervisor(place, config, secrets, workers).run(ready, on_look)
 
 
 def check(
@@ -453,7 +456,7 @@ def check(
     number: Annotated[int, typer.Argument(min=0, help="The chunk's number in the stream.")],
     home: OperatorHomeOption = OPERATOR_HOME, json: terminal.Json = False,
 ) -> None:  # fmt: skip
-    """Where is this chunk? Asks the inbox and the chain, and of one in a block the contract itself (checkData)."""
+    """Say where a chunk is. Asks the inbox and the chain, and of one in a block the contract itself (checkData)."""
     place = OperatorHome(home).require()
     with ledger_of(place) as ledger:
         found = status.locate(place, ledger, robot, stream, number)

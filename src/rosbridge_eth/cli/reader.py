@@ -100,7 +100,7 @@ def read(
     node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Fetch a robot's log from the chain, prove it, open it, and give its records as JSON lines, bag, table or plot.
+    """Give what a robot wrote, proven, from the chain. As JSON lines, bag, table or plot.
 
     What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
@@ -183,7 +183,7 @@ def compare(
     node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Hold a recording of your own against what the chain has of the same messages, field by field.
+    """Hold a recording of your own against what the chain has. Message by message, field by field.
 
     Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
     """
@@ -215,7 +215,7 @@ def evidence(
     node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Write one file that proves chosen records to somebody who has neither key nor node. It opens nothing else.
+    """Write a file that proves chosen records without key or node. It opens nothing else.
 
     Exits with 9, like read, where the log that they are from is not sound; the file is written nevertheless.
     """
@@ -247,7 +247,7 @@ def verify(
     node: Annotated[str | None, typer.Option(help="Ask this node whether the blocks are its chain's.")] = None,
     json: Json = False,
 ) -> None:
-    """Check evidence, without a node: what it shows goes to stdout as JSON lines, and what that proves is said.
+    """Check evidence, and say what it proves. What it shows goes to stdout as JSON lines; no node is needed.
 
     Exits with 9 where anything does not hold, with 7 where the node named does not answer.
     """
@@ -286,7 +286,7 @@ def grant(
     node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Hand the keys of a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
+    """Open a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
 
     They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
     """

@@ -59,7 +59,7 @@ def join(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: all topics of the ROS that is there.")] = False,
     password_file: terminal.PasswordFile = None,
 ) -> None:
-    """Make this machine a robot: its keys, its topics, and the request that the operator's `register` answers.
+    """Make this machine a robot: its keys, topics, and a request. The operator's `register` answers it.
 
     The answer is a bundle: put it into the robot's home, where `robot` takes it up. A bundle of `register` without a
     request holds the robot's keys and is all there is to join with.
@@ -148,7 +148,7 @@ def robot(
     password_file: terminal.PasswordFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Watch the configured topics and bring what they say to the server, until stopped or the source ends.
+    """Bring what the configured topics say to the server. Ends when it is stopped, or the source ends.
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
@@ -220,7 +220,7 @@ def trigger(
     name: Annotated[str | None, typer.Argument(help="One of them; without it, all.")] = None,
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
 ) -> None:
-    """Have the robot that runs with this home write what it keeps in memory, as if the event had happened now."""
+    """Have the robot write what it keeps in memory for an event. It runs with this home; the event is now."""
     from rosbridge_eth import metrics
 
     (place := RobotHome(home)).bridge()

@@ -133,6 +133,14 @@ def test_the_submitter_asks_as_seldom_as_it_says_and_is_seen_meanwhile(place: Pl
     assert seen == [float(second) for second in range(100, 150) if second != 110]
 
 
+def test_workers_that_were_given_at_the_start_are_no_change_of_the_file(place: Place, caplog: pytest.LogCaptureFixture):
+    secrets: Any = None
+    server = Supervisor(place.operator, load_server_config(place.operator.config), secrets, workers=3)
+    server._check = lambda config: None  # type: ignore[method-assign]
+    server._read_again({})
+    assert "taken up" in caplog.text and "next start" not in caplog.text
+
+
 def test_workers_are_named_by_their_numbers():
     assert [worker_name(number) for number in (0, 11)] == ["worker-0", "worker-11"]
 
