@@ -212,9 +212,12 @@ def test_a_name_is_asked_for_until_it_has_an_address_and_again_when_the_session_
     robot.until(lambda: sum(isinstance(event, Unresolved) for event in robot.events) == 3)
     assert robot.events[0].why.startswith("the address 'robots.example' cannot be found: Temporary failure")
     assert not robot.loop.resolved and robot.client.state == "idle"
-    places = [("127.0.0.1", 0), ("::1", 0)] if socket.has_ipv6 else [("127.0.0.1", 0)] * 2
-    for number, place in enumerate(places):  # the second time, the server has moved
-        worker = Worker(number, server_sockets(place)[0])
+    for number, place in enumerate([("127.0.0.1", 0), ("::1", 0)]):  # the second time, the server has moved
+        try:
+            [sock] = server_sockets(place)
+        except (OSError, NetworkError):  # a machine without IPv6
+            [sock] = server_sockets(("127.0.0.1", 0))
+        worker = Worker(number, sock)
         names.address = worker.loop.socket.getsockname()[:2]
         robot.until(lambda: robot.client.state == "connected")
         robot.ask([b"are you there?"])
