@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -169,10 +169,12 @@ class Database:
     def _reserved(self) -> bool:
         """Whether the reserve is there, or could be made."""
         size = 2 * self._wal_pages * _PAGE
-        with suppress(FileNotFoundError):
-            if self._reserve.stat().st_size == size:  # a crash may have cut it short
+        try:
+            if self._reserve.exists() and self._reserve.stat().st_size == size:  # a crash may have cut it short
                 return True
-        room = os.statvfs(self.path.parent)
+            room = os.statvfs(self.path.parent)
+        except OSError as error:
+            raise StoreError(f"the disk of the {self._what} {self.path} fails ({error.strerror})") from None
         if room.f_bavail * room.f_frsize < size:
             return False
         try:
@@ -196,8 +198,6 @@ class Database:
             if code == sqlite3.SQLITE_FULL:
                 raise DiskFull(f"the disk of {where} is full; make room, what was kept before is safe") from None
             raise StoreError(f"{where} cannot be used ({error}); what was kept before is safe") from None
-        except OSError as error:  # of the reserve
-            raise StoreError(f"the disk of the {self._what} {self.path} fails ({error.strerror})") from None
 
     def _damage(self, reason: str, *, move: bool) -> StoreError:
         number = 1

@@ -159,20 +159,16 @@ class Spool:
 
     def first_unconfirmed(self) -> tuple[bytes, int, bytes] | None:
         """Stream, number and digest of the oldest chunk that is not set aside."""
-        oldest = "SELECT stream, number, digest FROM chunk WHERE state != ? ORDER BY position LIMIT 1"
-        return self._place(oldest, _ASIDE)
+        return self.next_stream(b"")
 
     def next_stream(self, stream: bytes) -> tuple[bytes, int, bytes] | None:
         """The same of the stream that begins after this one; of the oldest other one if this one is not here."""
-        return self._place(
+        following = (
             "SELECT stream, number, digest FROM chunk WHERE state != ? AND stream != ? AND position >"
-            " (SELECT coalesce(max(position), 0) FROM chunk WHERE stream = ?) ORDER BY position LIMIT 1",
-            _ASIDE, stream, stream,
-        )  # fmt: skip
-
-    def _place(self, statement: str, *values: bytes | int) -> tuple[bytes, int, bytes] | None:
+            " (SELECT coalesce(max(position), 0) FROM chunk WHERE stream = ?) ORDER BY position LIMIT 1"
+        )
         with self._db.errors():
-            row = self._db.one(statement, values)
+            row = self._db.one(following, (_ASIDE, stream, stream))
         return None if row is None else (row[0], int.from_bytes(row[1], "big"), row[2])
 
     def following(self, stream: bytes, number: int | None, limit_bytes: int) -> list[Chunk]:
