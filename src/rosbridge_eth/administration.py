@@ -459,7 +459,7 @@ def revoke(
     The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
     of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters, and what a
     worker with a slow disk took later when it is run again.
-    ChainError: half done; it is run again when the node answers.
+    ChainError, StoreError: half done; it is run again when node and store answer.
     """
     with Registry(home.registry) as registry:
         known = any(enrolment.name == name for enrolment in registry.all(role))
@@ -484,8 +484,8 @@ def revoke(
         if ended and not in_force and not buried:
             raise IdentityError(nobody)
         return Revoked(None if ended else ledger.revoke_robot(keys.operator, tk).block, buried)
-    except ChainError as error:
-        raise ChainError(
+    except (ChainError, StoreError) as error:
+        raise type(error)(
             f"half done: the server takes nothing from {name} any more, but the contract does not know it yet"
-            f" ({error}); run `revoke {name}` again when the node answers"
+            f" ({error}); run `revoke {name}` again when that is mended"
         ) from error

@@ -11,6 +11,7 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from rosbridge_eth.config import Address, load_reader_config, load_server_config
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
+from rosbridge_eth.inbox import open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable
@@ -495,6 +497,11 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
             patched.setattr(world.ledger, call, down)
             with pytest.raises(ChainError, match=r"half done: .* run `revoke robot_1` again"):
                 world.revoke()
+    with monkeypatch.context() as patched:
+        patched.setattr(world, "open_inbox", partial(open_inbox, "redis://127.0.0.1:9", home=world.home.path,
+                                                     ledger=bytes(32), max_bytes=1, max_bytes_per_robot=1))
+        with pytest.raises(StoreError, match=r"half done: .* run `revoke robot_1` again"):
+            world.revoke()
     assert world.revoke().block is not None
     with pytest.raises(IdentityError, match="'robot_1' was revoked already"):
         world.revoke()
