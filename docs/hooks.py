@@ -106,7 +106,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
         path = _in_repository(source, target)
         shown = _page(path)
         if shown is None:
-            return text
+            return text.removeprefix("../")
         fragment = target.partition("#")[1:]
         return f"[{text}]({relpath(shown, Path(here).parent.as_posix())}{''.join(fragment)})"
 

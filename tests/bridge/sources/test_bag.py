@@ -213,7 +213,7 @@ def test_a_node_means_what_it_publishes(tmp_path):
 
 def test_a_name_that_is_not_there_is_told_with_what_is(bag):
     with pytest.raises(
-        SourceError, match=r"no topic or node /nmes; did you mean /names\?.*/custom \(my_pkg/msg/Custom"
+        SourceError, match=r"no topic or node /nmes; did you mean /names\? It has .*/custom \(my_pkg/msg/Custom"
     ):
         BagSource(bag, Selection(["/custom", "/nmes"]))
     with pytest.raises(SourceError, match=r"no topic or node /robot/\*\*"):
