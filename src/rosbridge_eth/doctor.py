@@ -47,8 +47,7 @@ from rosbridge_eth.topics import offered
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger
 
-HANDSHAKE_TIME = 6.0  # seconds for a server to answer
-ATTEMPT_TIME = 2.5  # seconds for one attempt; what a server says of a refusal is known when it ends
+HANDSHAKE_TIME, ATTEMPT_TIME = 6.0, 2.5  # seconds for a server to answer; for an attempt, with which a refusal is known
 EXPIRY = timedelta(days=30)
 LITTLE_ROOM, SOME_ROOM = 64 << 20, 1 << 30  # bytes
 WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
@@ -218,10 +217,9 @@ def chain(ledger: Ledger) -> Findings:
     if age < -WRONG_CLOCK:
         yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
     elif age > OLD_HEAD:
-        result = broken if age > DEAD_HEAD else note
-        yield result("clock", f"by it, the last block is {span(age)} old",
-                     "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
-                     " makes the next one with the next transaction)")
+        mended = ("set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
+                  " makes the next one with the next transaction)")  # fmt: skip
+        yield (broken if age > DEAD_HEAD else note)("clock", f"by it, the last block is {span(age)} old", mended)
 
 
 # An operator's home
@@ -241,9 +239,9 @@ def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings
                        f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
             continue
         if told != robots:
-            result = broken if nowhere else note
-            yield result("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
-                         f'write server = "{robots}" into the robot.toml of who joined with it')
+            found = f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}"
+            mended = f'write server = "{robots}" into the robot.toml of who joined with it'
+            yield (broken if nowhere else note)("bundle", found, mended)
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -444,8 +442,7 @@ def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
     if secret is None:
         yield skipped("passphrase", "none was given", "give --passphrase-file")
     else:
-        identity, _ = ids.load_identity(folder, secret)
-        yield ok("passphrase", f"opens the keys of {identity.name}")
+        yield ok("passphrase", f"opens the keys of {ids.load_identity(folder, secret)[0].name}")
 
 
 def reader_nodes(home: ReaderHome, secret: bytes | None) -> Findings:
@@ -471,8 +468,7 @@ CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
         "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
         "server": session,
     }),
-    HomeKind.READER: (ReaderHome, _MACHINE | {
-        "keys": own_keys, "node": reader_nodes, "archive": readers_archive}),
+    HomeKind.READER: (ReaderHome, _MACHINE | {"keys": own_keys, "node": reader_nodes, "archive": readers_archive}),
 }  # fmt: skip
 
 

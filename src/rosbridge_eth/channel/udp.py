@@ -55,7 +55,8 @@ def _resolve(host: str, port: int, flags: int = 0) -> tuple[int, Address]:
             f"the address {host!r} cannot be found: {getattr(error, 'strerror', error)}; see that this machine has a"
             " network and a name server, and that the name is right"
         ) from error
-    family, _, _, _, place = found[0]
+    # Of several the first that is IPv4, as servers listen where nothing else is said: `localhost` is ::1, too.
+    family, _, _, _, place = min(found, key=lambda one: one[0] != socket.AF_INET)
     return family, (str(place[0]), int(place[1]))
 
 

@@ -243,6 +243,17 @@ def test_an_address_that_is_of_no_use_here_is_none(monkeypatch, error):
     robot.loop.close()
 
 
+def test_of_several_addresses_of_a_name_the_first_that_is_ipv4_is_taken(monkeypatch):
+    """As `localhost` has on most machines, where a server listens on 0.0.0.0."""
+    six, four = ((family, socket.SOCK_DGRAM, 17, "", (host, 7410)) for family, host in
+                 ((socket.AF_INET6, "::1"), (socket.AF_INET, "127.0.0.1")))  # fmt: skip
+    for found, address in (([six, four], "127.0.0.1"), ([six], "::1")):
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, found=found, **__: found)
+        sock, taken = client_socket(("localhost", 7410))
+        sock.close()
+        assert taken == (address, 7410)
+
+
 def test_a_name_server_that_does_not_answer_keeps_nobody_waiting(monkeypatch):
     names = Names(monkeypatch)
     names.gate.clear()
