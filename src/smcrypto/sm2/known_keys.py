@@ -116,6 +116,7 @@ def _points(comb: Comb | None) -> int:
 known_keys: Final = KnownKeys()
 """The memory that verification, encryption and key exchange share."""
 
-if hasattr(os, "register_at_fork"):  # not on Windows. A child that inherits the lock of another thread waits for ever.
+if hasattr(os, "register_at_fork"):  # pragma: no branch - not on Windows
+    # A child that inherits the lock from a thread that it has not would wait for ever.
     _lock: Final = known_keys._lock
     os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
