@@ -92,8 +92,8 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
             told.add(str(error))
             # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
             parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
-            found, mark, mend = next((part for part in parts if part[2]), (str(error), "", ""))
-            yield broken(what, found + mark.strip(".;: "), mend or "correct what this names")
+            found, mark, todo = next((part for part in parts if part[2]), (str(error), "", ""))
+            yield broken(what, found + mark.strip(".;: "), todo or "correct what this names")
 
 
 # The machine

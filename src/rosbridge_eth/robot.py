@@ -74,7 +74,8 @@ class Robot:
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
-        self._dropped_before = spool.statistics().dropped_bodies
+        self.dropped_before = spool.statistics().dropped_bodies
+        """Of the bodies that the full spool gave up, those before this start."""
         self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
         self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
@@ -114,11 +115,6 @@ class Robot:
     def lost(self) -> dict[tuple[str, str], int]:
         """Messages that are not in the log, by topic and why: lost by the source, refused, no memory to keep them."""
         return {**self.source.lost, **self.capture.lost, **self.box.lost}
-
-    @property
-    def dropped(self) -> int:
-        """Chunks whose bodies the full spool gave up since the start."""
-        return self.spool.statistics().dropped_bodies - self._dropped_before
 
     @property
     def captured(self) -> int:
@@ -327,7 +323,7 @@ class Robot:
             "messages lost, since the spool took nothing":
                 len(self._ring) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
-            "chunks dropped from the full spool": self.dropped,
+            "chunks dropped from the full spool": spool.dropped_bodies - self.dropped_before,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]

@@ -262,7 +262,8 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
     ]
     spool, sender = running.spool.statistics(), running.sender.statistics
     written, sealed, confirmed = running.written, running.writer.sealed, running.confirmed()
-    known = not sender.refused and not running.dropped  # else some of what is below that place is not there
+    # Else some of what is below the newest confirmed place is not there.
+    known = not sender.refused and spool.dropped_bodies == running.dropped_before
     rows = [
         (topic, f"{rates.of(topic, written[topic], now):.1f}", written[topic], sealed[topic],
          *((sealed[topic] - confirmed[topic], confirmed[topic]) if known else "??"), lost[topic])

@@ -92,6 +92,7 @@ def parse_address(value: Any) -> Address:
 
 
 def counted(count: int, what: str) -> str:
+    """`1 chunk`, `2,000 chunks`."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
 
 

@@ -128,21 +128,24 @@ def test_keys_that_are_met_at_random_do_not_take_each_others_combs(monkeypatch):
     assert {P for _, P in memory._known} == {*POINTS[30:33]}
 
 
-def test_a_key_that_takes_a_place_begins_with_a_narrow_comb():
+def full_of_narrow_combs() -> KnownKeys:
+    """Of the first three points; there is no room for more."""
     memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
     for P in POINTS[:3]:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
+    return memory
+
+
+def test_a_key_that_takes_a_place_begins_with_a_narrow_comb():
+    memory = full_of_narrow_combs()
     use(memory, POINTS[3], 99)
     assert memory.comb(TINY_1009, POINTS[3]).width == 3
     assert [P for _, P in memory._known] == POINTS[1:4]
 
 
 def test_a_wider_comb_takes_nobody_elses_place():
-    memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
-    for P in POINTS[:3]:
-        use(memory, P, 1)
-        memory.comb(TINY_1009, P)
+    memory = full_of_narrow_combs()
     use(memory, POINTS[0], 9)
     assert memory.comb(TINY_1009, POINTS[0]).width == 3
     assert len(memory) == 3
