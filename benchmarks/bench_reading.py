@@ -3,9 +3,9 @@
     python benchmarks/bench_reading.py [--chunks 1000] [--records 100]
     python benchmarks/bench_reading.py --kept 150000        chunks of 10 records, as a robot at 10 Hz has in 42 hours
 
-The records are the sample's Odometry, all its fields; the chunks are sealed as a robot seals them, and read as the
-chain gives them, from memory: nodes and networks are not measured here. With --kept the chunks are taken for proven,
-kept, and asked for again; every number in them changes from record to record.
+The records are the sample's Odometry, pose and twist (as in bridge_costs.py) and then whole messages; the chunks are
+sealed as a robot seals them, and read as the chain gives them, from memory: nodes and networks are not measured here.
+With --kept the chunks are taken for proven, kept, and asked for again; their numbers change from record to record.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import resource
 import tempfile
 import time
 import tracemalloc
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import cycle, islice
 from pathlib import Path
@@ -25,6 +26,7 @@ from typing import Any
 
 from eth_hash.auto import keccak
 
+from bridge_costs import POSE_AND_TWIST
 from rosbridge_eth.capture import Capture, MessageLine, TopicRule, definition_line, parse_line, stream_line
 from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
@@ -41,10 +43,10 @@ LEDGER, NAME, ACCOUNT = b"L" * 32, "robot_1", "0x" + "00" * 20
 TYPE = "nav_msgs/msg/Odometry"
 
 
-def sample_lines() -> tuple[list[bytes], list[bytes]]:
-    """The lines that open a stream, and those of the sample's Odometry."""
+def sample_lines(fields: Sequence[str] = ()) -> tuple[list[bytes], list[bytes]]:
+    """The lines that open a stream, and those of the sample's Odometry with these fields, or all."""
     source = BagSource(sample_bag(), Selection(["/robot_1/odom"]))
-    capture = Capture([TopicRule("/robot_1/odom")], source_kind="bag")
+    capture = Capture([TopicRule("/robot_1/odom", fields=tuple(fields))], source_kind="bag")
     captured = [found for raw in source.messages() if (found := capture.process(raw, T0_MS * 10**6, True))]
     opening = [stream_line("bag", "rosbridge_eth 2.0"), definition_line(captured[0].decoder)]
     return opening, [one.line for one in captured]
@@ -106,16 +108,22 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             kept(arguments.kept, Path(folder, "proven"))
         return
+    for what, fields in (("pose and twist", POSE_AND_TWIST), ("whole messages", ())):
+        proven(what, fields, arguments.chunks, arguments.records)
+
+
+def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None:
+    """What it costs to read and prove so many chunks of so many records."""
     authority = create_ca("CA", at=START)
     robot = enrol(authority, Role.ROBOT, NAME, at=START)
     reader = enrol(authority, Role.READER, "owner", at=START).encryption_key
-    log, opening, lines = Log(LEDGER, robot_id(NAME)), *sample_lines()
+    log, opening, lines = Log(LEDGER, robot_id(NAME)), *sample_lines(fields)
     endless, previous, chunks = cycle(lines), bytes(32), []
-    for number in range(arguments.chunks):
-        content = (opening if number == 0 else []) + list(islice(endless, arguments.records))
+    for number in range(count):
+        content = (opening if number == 0 else []) + list(islice(endless, per_chunk))
         chunk = seal(
             log, robot.signing_key, content, stream=b"s" * 16, number=number, previous=previous,
-            sealed_ms=T0_MS + 1000 * number, readers=[reader.public_key], goodbye=number == arguments.chunks - 1,
+            sealed_ms=T0_MS + 1000 * number, readers=[reader.public_key], goodbye=number == count - 1,
         )  # fmt: skip
         previous = chunk.header.digest
         chunks.append(chunk)
@@ -127,19 +135,19 @@ def main() -> None:
     def read() -> int:
         verifier = Verifier(
             NAME, LEDGER, standing, registered, trust=Trust([authority.certificate]), reader=reader, block=9,
-            block_time=lambda block: T0_MS // 1000 + arguments.chunks, now=T0_MS / 1000,
+            block_time=lambda block: T0_MS // 1000 + count, now=T0_MS / 1000,
         )  # fmt: skip
         events = (DataEvent(at, 0, tuple(encoded[at : at + 8]), 9, b"", ACCOUNT) for at in range(0, len(encoded), 8))
-        records = sum(len(proven.records) for proven in verifier.read(events))
+        records = sum(len(read_chunk.records) for read_chunk in verifier.read(events))
         verdict = verifier.verdict()
-        if not verdict.sound or records != arguments.chunks * arguments.records:
+        if not verdict.sound or records != count * per_chunk:
             raise SystemExit("\n".join(verdict.lines()))
         return records
 
     size = sum(map(len, encoded))
     machine = f"{platform.machine()}, Python {platform.python_version()}"
-    print(f"{machine}: {len(encoded)} chunks of {arguments.records} records")
-    print(f"{size / arguments.chunks / arguments.records:8.1f} bytes a record on the chain")
+    print(f"{machine}: {len(encoded)} chunks of {per_chunk} records, {what}")
+    print(f"{size / count / per_chunk:8.1f} bytes a record on the chain")
     for name in ("cold", "warm"):
         begin = time.process_time()
         records = read()
@@ -150,7 +158,7 @@ def main() -> None:
         ("signature", lambda chunk: is_signed(log, robot.signing_key.public_key, chunk)),
         ("content key", lambda chunk: content_key(chunk.header, reader)),
         ("content key, and opening", lambda chunk: open_lines(log, chunk, content_key(chunk.header, reader))),
-        ("parsing", lambda chunk: [parse_line(line) for line in lines[: arguments.records]]),
+        ("parsing", lambda chunk: [parse_line(line) for line in lines[: per_chunk]]),
     ):
         begin = time.process_time()
         for chunk in chunks[:200]:

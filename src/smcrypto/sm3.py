@@ -126,7 +126,9 @@ def digest(data: BytesLike) -> bytes:
     >>> digest(b"").hex()[:16]
     '1ab21d8355cfa17f'
     """
-    return _started(as_bytes(data, "data")).digest()
+    state = _EMPTY.copy()  # written out, not `_started`: a call less is a tenth of a short message's time
+    state.update(data if type(data) is bytes else as_bytes(data, "data"))
+    return state.digest()
 
 
 def hmac(key: BytesLike, data: BytesLike) -> bytes:
