@@ -334,7 +334,10 @@ class Reception:
         outcomes = self._append([(session.tk, chunk) for session, chunk in gathered], now, wall)
         for (session, chunk), outcome in zip(gathered, outcomes or (), strict=False):
             self._take_outcome(session, chunk, outcome, now)
+        in_force = self._in_force()  # after the commit: of what a slow disk took, `revoke` knows nothing
         for session in waiting:
+            if in_force.get(session.tk) != session.certificates:
+                continue  # `look` closes it
             why = "the server's store is away" if outcomes is None else session.mismatch
             if outcomes is None:  # what is behind a chunk that was not taken is not taken either
                 session.offers.clear()

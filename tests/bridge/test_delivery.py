@@ -319,6 +319,22 @@ def test_a_session_of_somebody_who_is_revoked_ends_within_two_seconds(tmp_path: 
     assert world.run(2, until=lambda: not world.sender.statistics.connected)
 
 
+def test_what_a_slow_disk_took_of_somebody_who_was_revoked_meanwhile_is_not_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world, append = World(tmp_path, 8, Faults()), SqliteInbox.append
+
+    def slow(inbox: SqliteInbox, chunks: list[tuple[bytes, Chunk]], now: float) -> object:
+        world.allowed = world.allowed and not chunks
+        return append(inbox, chunks, now)
+
+    monkeypatch.setattr(SqliteInbox, "append", slow)
+    world.capture(5)
+    assert world.run(60, until=lambda: not world.allowed and not world.sender.statistics.connected)
+    assert world.stored()
+    assert world.spool.statistics().unstored == world.spool.statistics().chunks > 0
+
+
 @pytest.mark.parametrize("junk", [b"", b"\x02", b"\x02junk", b"\x01" + bytes(10), b"\xff" * 100])
 def test_what_is_no_message_ends_the_session_and_nothing_else(tmp_path: Path, junk: bytes) -> None:
     world = World(tmp_path, 9, Faults())
