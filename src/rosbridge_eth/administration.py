@@ -486,6 +486,6 @@ def revoke(
         return Revoked(None if ended else ledger.revoke_robot(keys.operator, tk).block, buried)
     except (ChainError, StoreError) as error:
         raise type(error)(
-            f"half done: the server takes nothing from {name} any more, but the contract does not know it yet"
-            f" ({error}); run `revoke {name}` again when that is mended"
+            f"half done: the server takes nothing from {name} any more, but chain or store did not follow ({error});"
+            f" run `revoke {name}` again when that is mended"
         ) from error
