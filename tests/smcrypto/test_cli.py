@@ -228,6 +228,7 @@ def test_a_key_that_cannot_be_written_leaves_nothing_behind(folder: Path, capsys
     (["encrypt", "--password-file", "password", "--iv", "00", "message"], "--iv belongs to"),
     (["encrypt", "--sm4-key-file", "sm4.key", "message"], "needs --iv"),
     (["encrypt", "--sm4-key-file", "sm4.key", "--iv", "00", "message"], "iv must be 16 bytes"),
+    (["encrypt", "--to", "pub.pem", "--mode", "ctr", "message"], "--to takes no --mode"),
     (["encrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--to", "pub.pem", "message"], "neither --to"),
     (["decrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--key", "key.pem", "message"], "neither --key"),
     (["decrypt", "--sm4-key-file", "sm4.key", "--iv", "00" * 16, "--password-file", "password"], "nor a password"),

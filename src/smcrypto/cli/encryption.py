@@ -53,13 +53,15 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
                         help="of PBKDF2 under a password; openssl's -iter (default: %(default)s)")
     parser.add_argument("--sm4-key-file", type=Path, metavar="FILE", help="SM4 key: the 16 bytes of FILE")
     parser.add_argument("--iv", metavar="HEX", help="with --sm4-key-file: 32 hex digits, never used twice")
-    parser.add_argument("--mode", choices=tuple(MODES), default="cbc", help="SM4 mode (default: %(default)s)")
+    parser.add_argument("--mode", choices=tuple(MODES), help="SM4 mode (default: cbc)")
     add_output(parser)
     add_input(parser)
 
 
 def _require_one_secret(options: argparse.Namespace, key_file: Path | None, name: str) -> None:
     """What would be ignored is refused: of an SM2 key, a password and an SM4 key there is one."""
+    if key_file is not None and options.mode is not None:
+        raise InvalidOption(f"{name} takes no --mode: SM2 encrypts by itself")
     if options.sm4_key_file is None:
         if options.iv is not None:
             raise InvalidOption("--iv belongs to --sm4-key-file")
@@ -70,7 +72,8 @@ def _require_one_secret(options: argparse.Namespace, key_file: Path | None, name
 
 
 def _cipher(key: bytes, iv: bytes, options: argparse.Namespace) -> sm4.Cipher:
-    return sm4.Cipher(key, MODES[options.mode](iv), padding="pkcs7" if options.mode == "cbc" else None)
+    mode = options.mode or "cbc"
+    return sm4.Cipher(key, MODES[mode](iv), padding="pkcs7" if mode == "cbc" else None)
 
 
 def _explicit(options: argparse.Namespace) -> tuple[bytes, bytes]:
