@@ -98,10 +98,10 @@ def _extent(encoded: bytes, at: int) -> tuple[bool, int, int]:
 
 
 def _string(encoded: bytes) -> bytes:
-    """The one RLP string that this is."""
+    """The one RLP string, of 32 bytes at most, that this is."""
     is_list, start, end = _extent(encoded, 0)
-    if is_list or end != len(encoded):
-        raise VerificationError("what should be an RLP string is none")
+    if is_list or end != len(encoded) or end - start > 32:
+        raise VerificationError("what should be an RLP string of up to 32 bytes is none")
     return encoded[start:end]
 
 

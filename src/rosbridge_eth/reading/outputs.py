@@ -48,12 +48,16 @@ from rosbridge_eth.reading.verify import ProvenRecord
 NOTES: Final = "/rosbridge_eth/notes"
 MAX_NOTES: Final = 1_000
 MAX_COLUMNS: Final = 4_096
+MAX_NAME: Final = 255
+"""Characters of a column's name; what has more is left out. Else a path could stand again for each field below it."""
 MAX_TRACKS: Final = 32
 """Topics in one picture; what is on further ones is left out."""
 MAX_POINTS: Final = 1 << 13
 _BATCH: Final = 4_096  # rows of a Parquet file that are made at once
 _FARTHEST: Final = 1e12
 """Metres from the origin; a position beyond is no position."""
+_HIGHEST: Final = 1e300
+"""Of a number that is drawn; matplotlib needs some room above."""
 _STRING: Final = "std_msgs/msg/String"
 _MCAP_END: Final = struct.pack("<BQI BQQQI", 0x0F, 4, 0, 0x02, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
 """Data End without a checksum, Footer without a summary, magic (mcap.dev/spec)."""
@@ -114,7 +118,7 @@ def check_table(path: Path) -> None:
 
 _FIXED: Final = {
     "topic": "text", "type": "text", "source": "text", "received_ns": "time", "captured_ns": "time", "clock": "bool",
-    "stream": "text", "number": "int", "chunk": "int", "record": "int", "block": "int", "transaction": "text",
+    "stream": "text", "number": "uint", "chunk": "int", "record": "int", "block": "int", "transaction": "text",
 }  # fmt: skip
 """Columns of every table; after them those of the messages' fields, a dot between the levels.
 
@@ -135,9 +139,10 @@ class Table:
 
     def write(self, record: ProvenRecord) -> None:
         content, place = record.content, record.place
-        times, cells = _time_fields(record.definition), dict(flattened(content.data, ""))
+        times = _time_fields(record.definition)
+        cells = {printable(name): value for name, value in flattened(content.data, "")}
         for column, value in cells.items():
-            if column in self._columns or len(self._columns) < MAX_COLUMNS:
+            if column in self._columns or (len(self._columns) < MAX_COLUMNS and len(column) <= MAX_NAME):
                 kind = _kind(value)
                 self._columns.setdefault(column, set()).add("time" if kind == "int" and column in times else kind)
         row = [
@@ -155,7 +160,7 @@ class Table:
 
     def _names(self, fixed: Collection[str]) -> Iterator[str]:
         yield from fixed
-        yield from (f".{column}" if column in fixed else column for column in self._columns)
+        yield from (f".{column}" if column.lstrip(".") in fixed else column for column in self._columns)
 
     def flush(self) -> None:
         if self._grows is not None:
@@ -175,7 +180,7 @@ class Table:
         pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
         kinds = [{kind} for kind in _FIXED.values()] + list(self._columns.values())
         types, values = zip(*(_arrow(pyarrow, found - {""}) for found in kinds), strict=True)
-        names = [printable(column) for column in self._names([column.removesuffix("_ns") for column in _FIXED])]
+        names = self._names([column.removesuffix("_ns") for column in _FIXED])
         schema, rows = pyarrow.schema(zip(names, types, strict=True)), self._read()
         with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
             while batch := list(islice(rows, _BATCH)):
@@ -187,8 +192,9 @@ class Table:
 
 
 def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+    """The fields that are no messages, a dot between the levels; a path beyond MAX_NAME characters goes no deeper."""
     for name, value in data.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and len(path) + len(name) <= MAX_NAME:
             yield from flattened(value, f"{path}{name}.")
         else:
             yield path + name, value
@@ -215,6 +221,8 @@ def _arrow(pyarrow: Any, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
         return pyarrow.timestamp("ns", tz="UTC"), int
     if kinds == {"bool"}:
         return pyarrow.bool_(), bool
+    if kinds == {"uint"}:
+        return pyarrow.uint64(), int
     if kinds and kinds <= {"int", "time"}:
         return pyarrow.int64(), int
     if kinds and kinds <= _NUMBERS:
@@ -248,7 +256,7 @@ def _cell(value: Any) -> Any:
     """Text without what acts on a terminal, and not to be taken for a formula by a spreadsheet."""
     if isinstance(value, list):
         return json.dumps(value)
-    if not isinstance(value, str):
+    if not isinstance(value, str) or value in NOT_FINITE:
         return value
     text = printable(value)
     return "'" + text if text.startswith(("=", "+", "-", "@")) else text
@@ -492,7 +500,8 @@ class Curves:
         for field_, path in self._paths.items():
             value = _at(record.content.data, path)
             key = field_, record.content.topic
-            if type(value) in (int, float, bool) and (key in self.curves or len(self.curves) < MAX_TRACKS):
+            drawn = type(value) in (int, float, bool) and abs(value) <= _HIGHEST
+            if drawn and (key in self.curves or len(self.curves) < MAX_TRACKS):
                 curve = self.curves.setdefault(key, _Points(lambda a, b: (a[0], min(a[1], b[1]), max(a[2], b[2]))))
                 curve.add((record.content.received_ns, float(value), float(value)))
 

@@ -446,6 +446,27 @@ def test_who_is_not_the_robot_by_the_ca_is_refused(ca, role, name, node: Anvil, 
     assert "no certificate governs it" in answer
 
 
+def test_certificates_that_are_none_hide_none_that_follow(node: Anvil, javascript):
+    """The contract takes whatever the operator registers: here the beginning of a certificate, of nothing."""
+    made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
+    nothing = bytes.fromhex("3011" "300aa0030201020201013000" "3000" "030100") * 2
+    for account, certificates in ((KEYS.robot(3), nothing), (KEYS.robot(1), robot().public.certificates)):
+        made.ledger.replace_registration(KEYS.operator, made.pen.log.tk, account.address, certificates)
+    made.write(made.pen.write(odometry(1)))
+    found = both(made.evidence(Choice("/robot_1/odom")).encode(), javascript)
+    assert [one.key is None for one in found.certificates] == [False, True, False]
+
+
+def test_more_of_the_cas_than_a_file_may_have_is_refused_in_both_languages(javascript):
+    value = json.loads((VECTORS / "span.json").read_text())
+    more = [create_ca(f"CA {n}", at=START).certificate for n in range(16)]
+    value["authorities"] = sorted([*value["authorities"], *(one.to_der().hex() for one in more)])
+    text = json.dumps(value, separators=(",", ":"))
+    with pytest.raises(VerificationError, match="at most 16"):
+        check(text, [*read_certificates((VECTORS / "ca.crt.pem").read_bytes()), *more])
+    assert "too much" in javascript([text])[0]
+
+
 def test_a_page_that_this_version_did_not_write_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     page, file = Evidence.read((VECTORS / "span.json").read_bytes()).page(), tmp_path / "page.html"
     for text, told in ((page, False), (page.replace("The record", "The only record"), True)):
@@ -524,9 +545,13 @@ def test_a_large_leaf_is_read_once(one: str, javascript):
     assert "leaf of another" in javascript([text])[0]
 
 
-def invented(receipt: Callable[[list[Any]], Any] = list, state: Callable[[bytes], bytes] = bytes) -> str:
-    """The vector on blocks of one's own: every receipt as `receipt` makes it, `state` above the state's root, and all
-    tries, headers and hashes made anew. Who has no key of the robot can go so far.
+def invented(
+    receipt: Callable[[list[Any]], Any] = list,
+    state: Callable[[bytes], bytes] = bytes,
+    slot: Callable[[int, int], int] = lambda n, value: value,
+) -> str:
+    """The vector on blocks of one's own: every receipt as `receipt` makes it, `state` above the state's root, the tail
+    as `slot` makes it, and all tries, headers and hashes made anew. Who has no key of the robot can go so far.
     """
     e = Evidence.read((VECTORS / "span.json").read_bytes())
     old, last, tk = proofs.Nodes(e.nodes), proofs.Header.parse(e.blocks[-1].header), keccak(NAME.encode())
@@ -549,7 +574,7 @@ def invented(receipt: Callable[[list[Any]], Any] = list, state: Callable[[bytes]
         fields[5], made = trie(changed)
         tries |= made
         if header == last:
-            words = {keccak(slot.to_bytes(32)): rlp.encode(storage[slot]) for slot in set(slots)}
+            words = {keccak(n.to_bytes(32)): rlp.encode(slot(n == slots[1], storage[n])) for n in set(slots)}
             (root, made), code = trie(words), proofs.code_hash()
             account = keccak(rlp.encode([b"\x20" + keccak(e.contract), rlp.encode([b"", b"", root, code])]))
             tries |= made | {account: rlp.encode([b"\x20" + keccak(e.contract), rlp.encode([b"", b"", root, code])])}
@@ -584,6 +609,7 @@ INVENTED = {
     "events of what failed": lambda: invented(lambda fields: [b"", *fields[1:]]),
     "a signature in other bytes": lambda: invented(with_log(2, in_other_bytes)),
     "a receipt of five fields": lambda: invented(lambda fields: [*fields, b""]),
+    "a slot of 33 bytes": lambda: invented(slot=lambda n, value: value | n << 256),
     "an extension without nibbles": lambda: invented(state=lambda account: rlp.encode([b"\0", account])),
 }  # fmt: skip
 
@@ -632,6 +658,9 @@ GOOD_LINE = odometry(1)
 LINES = {
     "a name twice": GOOD_LINE.replace(b'"data":{', b'"data":{"pose":1,'), "half a character": message(1, text="?"),
     "beyond a double": GOOD_LINE.replace(b'"z":0.0', b'"z":1e400'),
+    "a zero before a number": GOOD_LINE.replace(b'"z":0.0', b'"z":00000000000000001'),
+    "a zero before a time": GOOD_LINE.replace(b'"received_ns":', b'"received_ns":0'),
+    "a time below zero": GOOD_LINE.replace(b'"received_ns":', b'"received_ns":-'),
     "a space": GOOD_LINE.replace(b'"z":', b'"z": '), "an escape too many": GOOD_LINE.replace(b'"z"', b'"\\u007a"'),
     "a time as text": re.sub(rb'"received_ns":(\d+)', rb'"received_ns":"\1"', GOOD_LINE),
     "too deep": message(1, a=0).replace(b'"a":0', b'"a":' + b"[" * 99 + b"]" * 99),
@@ -643,16 +672,18 @@ LINES = {
 def test_lines_that_only_a_lying_robot_writes_are_refused_in_both_languages(node: Anvil, javascript):
     made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
     LINES["half a character"] = LINES["half a character"].replace(b"?", b"\\ud800")
-    lines = [message(at(0.1), text="\ufffd"), *LINES.values()]
+    minus_zero = re.sub(rb'"captured_ns":\d+', b'"captured_ns":-0', GOOD_LINE)  # an integer of JSON, and none below 0
+    lines = [message(at(0.1), text="\ufffd"), minus_zero, *LINES.values()]
     chunk = made.pen.write(*lines)
     made.write(chunk)
     text = made.evidence(Choice(to_ns=at(0.2))).encode()
-    assert len(both(text, javascript).records) == 1
+    assert len(both(text, javascript).records) == 2
     key, texts = content_key(chunk.header, reader().encryption_key), [text.replace("\\ufffd", "\\ud800")]
-    for n in range(1, len(lines)):
+    for n in range(2, len(lines)):
         proof, value = next(record_proofs(lines, key, [n])), json.loads(text)
         path = [each.hex() for each in proof.path]
-        value["records"][0] |= {"record": n, "line": lines[n].decode(), "salt": proof.salt.hex(), "path": path}
+        shown = {"chunk": 0, "record": n, "line": lines[n].decode(), "salt": proof.salt.hex(), "path": path}
+        value["records"] = [shown]
         texts.append(json.dumps(value, separators=(",", ":")))
     answers = javascript(texts)
     for what, one_text, answer in zip(["half a character in the file", *LINES], texts, answers, strict=True):

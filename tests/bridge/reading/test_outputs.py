@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import struct
 from collections.abc import Iterable
 from contextlib import suppress
@@ -148,12 +149,12 @@ def test_a_table_has_a_column_for_each_field_of_any_record(tmp_path):
 
 
 def test_no_cell_is_taken_for_a_formula_or_acts_on_a_terminal(tmp_path):
-    hostile = {"=cmd|' /C calc'!A0": "=1+1", "@x": "+1", "s": EVIL, "n": -3}
+    hostile = {"=cmd|' /C calc'!A0": "=1+1", "@x": "+1", "s": EVIL, "n": -3, "low": "-Infinity"}
     with outputs.table(tmp_path / "t.csv") as table:
         table.write(record(1, "pkg/msg/A", hostile, "-topic"))
     [row] = read_table(tmp_path / "t.csv")
     assert not any(cell.startswith(("=", "@", "+")) for cell in [*row, *row.values()])
-    assert (row["topic"], row["n"]) == ("'-topic", "-3")
+    assert (row["topic"], row["n"], float(row["low"])) == ("'-topic", "-3", -math.inf)
     assert all(text.isprintable() for text in (tmp_path / "t.csv").read_text("utf-8").splitlines())
 
 
@@ -162,6 +163,15 @@ def test_columns_are_bounded(tmp_path):
         for n in range(12):
             table.write(record(n, "pkg/msg/A", {f"f{n}_{m}": m for m in range(500)}))
     assert len(read_table(tmp_path / "t.csv")[0]) == outputs.MAX_COLUMNS + 12
+
+
+def test_a_path_of_any_length_costs_no_more_than_the_record_has(tmp_path):
+    deep = {"n" * 30_000: {f"f{n}": n for n in range(2_000)}, "m" * 200: {"m" * 54: {"x": 5}, "m" * 52: {"x": 6}}}
+    with outputs.table(tmp_path / "t.csv") as table:
+        table.write(record(1, "pkg/msg/A", deep))
+    assert (tmp_path / "t.csv").stat().st_size < 2_000
+    [row] = read_table(tmp_path / "t.csv")
+    assert [value for name, value in row.items() if name[0] == "m"] == ["6"]
 
 
 # --- bags
@@ -442,6 +452,14 @@ def test_elements_of_arrays_and_what_is_no_number():
         "deep[0].x": [(T0 + 1, 7.0, 7.0)]}  # fmt: skip
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_highest_numbers_are_drawn_or_left_out(tmp_path):
+    curves = outputs.Curves(["x"])
+    for n, value in enumerate((1e300, -1e300, 1.7e308, -1.7e308, 5e-324, 2**64 - 1)):
+        curves.write(record(n, "pkg/msg/A", {"x": value}))
+    assert curves.draw(tmp_path / "p.png") == 4
+
+
 @pytest.mark.parametrize("field", ["", "a..b", "a[x]", "a b", ".a", "$x$", "a["])
 def test_what_names_no_field(field):
     with pytest.raises(ConfigError, match="names no field"):
@@ -491,7 +509,7 @@ def test_a_parquet_file_has_numbers_times_and_lists(tmp_path, monkeypatch):
     types = {field.name: str(field.type) for field in table.schema}
     assert types | {
         "topic": "string", "received": "timestamp[ns, tz=UTC]", "captured": "timestamp[ns, tz=UTC]", "clock": "bool",
-        "stream": "string", "number": "int64", "chunk": "int64", "block": "int64", "transaction": "string",
+        "stream": "string", "number": "uint64", "chunk": "int64", "block": "int64", "transaction": "string",
         "header.stamp": "timestamp[ns, tz=UTC]", "header.frame_id": "string", "joints": "list<element: double>",
         "ids": "list<element: int64>", "on": "bool", "n": "int64", "f": "double", "big": "string", "mixed": "string",
         "empty": "string", "x": "double",
@@ -516,6 +534,21 @@ def test_a_field_that_is_named_as_a_column_of_every_table_has_one_of_its_own(tmp
     [found] = table.drop(["received", "captured"]).to_pylist()
     assert (found["topic"], found[".topic"], found[".number"], found[".received"]) == ("/its", "mine", 5, 1.5)
     assert found["received_ns"] == 6
+
+
+def test_whatever_only_a_lying_robot_signs_a_table_can_be_read(tmp_path):
+    """Names that would be one column twice, and the highest number that a chunk can have."""
+    fields = {"topic": 1, ".topic": 2, "..topic": 3, "\x01": 4, "\\u0001": 5, "": 6, "a.b": 7, "a": {"b": 8}}
+    lying = record(1, "pkg/msg/A", fields)
+    lying = lying._replace(place=PLACE._replace(number=2**64 - 1))
+    table = parquet(tmp_path / "t.parquet", [lying])
+    [found] = table.drop(["received", "captured"]).to_pylist()
+    assert (found["number"], found["topic"], found["a.b"], found["\\u0001"]) == (2**64 - 1, "/t", 8, 5)
+    assert [found[f"{'.' * n}topic"] for n in (1, 2, 3)] == [1, 2, 3]
+    with outputs.table(tmp_path / "t.csv") as written:
+        written.write(lying)
+    [row] = read_table(tmp_path / "t.csv")
+    assert row["number"] == str(2**64 - 1) and set(row) >= set(found)
 
 
 def test_columns_that_hold_this_and_that_are_text(tmp_path):
