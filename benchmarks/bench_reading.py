@@ -27,7 +27,7 @@ from typing import Any
 from eth_hash.auto import keccak
 
 from bridge_costs import POSE_AND_TWIST
-from rosbridge_eth.capture import Capture, MessageLine, TopicRule, definition_line, parse_line, stream_line
+from rosbridge_eth.capture import Capture, MessageLine, TopicRule, parse_line, stream_line
 from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
@@ -48,7 +48,7 @@ def sample_lines(fields: Sequence[str] = ()) -> tuple[list[bytes], list[bytes]]:
     source = BagSource(sample_bag(), Selection(["/robot_1/odom"]))
     capture = Capture([TopicRule("/robot_1/odom", fields=tuple(fields))], source_kind="bag")
     captured = [found for raw in source.messages() if (found := capture.process(raw, T0_MS * 10**6, True))]
-    opening = [stream_line("bag", "rosbridge_eth 2.0"), definition_line(captured[0].decoder)]
+    opening = [stream_line("bag", "rosbridge_eth 2.0"), captured[0].definition[1]]  # type: ignore[index]
     return opening, [one.line for one in captured]
 
 

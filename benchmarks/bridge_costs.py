@@ -37,7 +37,7 @@ from typing import Any
 from eth_hash.auto import keccak
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
@@ -176,13 +176,13 @@ def stage_costs(
     number, messages = 0, iter(Odometry(records))
     while taken := list(islice(messages, turn)):  # many at once, since the watch itself takes some microseconds
         with watch("robot: capture"):
-            captured = [(raw, capture.process(raw, time.time_ns(), True)) for raw in taken]
+            captured = [capture.process(raw, time.time_ns(), True) for raw in taken]
         closed: list[Chunk] = []
         with watch("robot: seal"):
-            for raw, record in captured:
+            for record in captured:
                 assert record is not None
                 number, now = number + 1, time.monotonic()
-                writer.add(record.line, now, (record.type_name, definition_line(raw.decoder)))
+                writer.add(record.line, now, record.definition)
                 if number % per_chunk == 0:
                     closed += writer.closed(now + 2.0, time.time_ns() // 10**6)
         chunks += closed

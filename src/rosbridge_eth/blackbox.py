@@ -19,12 +19,14 @@ import operator
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import orjson
 from rosbags.interfaces import Nodetype
 
-from rosbridge_eth.capture import Conversion, DecodeError, Decoder, NamePattern, RawMessage, trigger_line
+from rosbridge_eth.capture import Conversion, DecodeError, Decoder, NamePattern, RawMessage, Record, trigger_line
 from rosbridge_eth.capture.conversion import BYTES
 from rosbridge_eth.capture.definitions import DURATION, TIME
 from rosbridge_eth.capture.messages import MAX_RAW
@@ -135,16 +137,6 @@ class TriggerRule(NamedTuple):
     when: tuple[Condition, ...] = ()
 
 
-class Record(NamedTuple):
-    """A captured line on its way to the writer. definition: as LogWriter.add takes it; archive: its `archived`."""
-
-    topic: str
-    received_ns: int
-    line: bytes
-    definition: tuple[str, bytes] | None
-    archive: bool = False
-
-
 class Ring:
     """The newest records of a length of time that fit into so many bytes, in the order in which they came."""
 
@@ -242,7 +234,7 @@ class BlackBox:
             for rule in rules
         }
         self._conditions: dict[str, list[tuple[Trigger, Condition]]] = {}
-        self._compiled: dict[tuple[Condition, Decoder], Callable[[RawMessage], bool] | None] = {}
+        self._compiled = lru_cache(MAX_DECODERS)(self._compile)
         for trigger in self.triggers.values():
             for condition in trigger.rule.when:
                 self._conditions.setdefault(condition.topic, []).append((trigger, condition))
@@ -259,24 +251,16 @@ class BlackBox:
         """Whether this message is an event; every message of a condition's topic is looked at, captured or not."""
         self.newest_ns = raw.received_ns
         for trigger, condition in self._conditions.get(raw.topic, ()):
-            if self._holds(trigger, condition, raw):
-                self.fire(raw.received_ns, condition.text, trigger.rule.name)
+            with suppress(DecodeError):  # capture tells of it
+                if self._compiled(condition, raw.decoder)(raw):
+                    self.fire(raw.received_ns, condition.text, trigger.rule.name)
 
-    def _holds(self, trigger: Trigger, condition: Condition, raw: RawMessage) -> bool:
-        key = condition, raw.decoder
-        if key not in self._compiled:
-            while len(self._compiled) >= MAX_DECODERS:
-                del self._compiled[next(iter(self._compiled))]
-            try:
-                self._compiled[key] = condition.compiled(raw.decoder)
-            except ConfigError as error:
-                self._compiled[key] = None
-                log.error("trigger %s: %r does not hold for this type: %s", trigger.rule.name, condition.text, error)
-        holds = self._compiled[key]
+    def _compile(self, condition: Condition, decoder: Decoder) -> Callable[[RawMessage], bool]:
         try:
-            return holds is not None and holds(raw)
-        except DecodeError:
-            return False  # capture tells of it
+            return condition.compiled(decoder)
+        except ConfigError as error:
+            log.error("%r does not hold for this type: %s", condition.text, error)
+            return lambda raw: False
 
     def keep(self, name: str, record: Record) -> None:
         """Take a record of a topic of this trigger: for the log, while an event lasts; else into memory."""

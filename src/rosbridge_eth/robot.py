@@ -21,8 +21,8 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from rosbridge_eth.blackbox import BlackBox, Record
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule, definition_line, stream_line
+from rosbridge_eth.blackbox import BlackBox
+from rosbridge_eth.capture import Capture, RawMessage, Record, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
@@ -236,15 +236,11 @@ class Robot:
     def _capture(self, raw: RawMessage, now: float) -> None:
         self._taken += len(raw.raw)
         self.box.look(raw)
-        captured = self.capture.process(raw, time.time_ns(), self._synchronised)
-        if captured is None:
-            return
-        definition = raw.type_name, definition_line(raw.decoder)
-        record = Record(raw.topic, raw.received_ns, captured.line, definition, captured.archive)
-        if captured.trigger is None:
+        record = self.capture.process(raw, time.time_ns(), self._synchronised)
+        if record is not None and record.trigger is not None:
+            self.box.keep(record.trigger, record)
+        elif record is not None:
             self._write(record, now)
-        else:
-            self.box.keep(captured.trigger, record)
 
     def _write(self, record: Record, now: float) -> None:
         self.writer.add(record.line, now, record.definition, topic=record.topic, archived=record.archive)
@@ -429,14 +425,8 @@ def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> N
     if first > last:
         return  # the source has said that it replays nothing
     for rule in rules:
-        key = (
-            "at" if rule.at_ns is not None and rule.at_ns > last
-            else "from" if rule.from_ns is not None and rule.from_ns > last
-            else "until" if rule.until_ns is not None and rule.until_ns <= first
-            else None
-        )  # fmt: skip
-        if key is not None:
+        if max(rule.at_ns or 0, rule.from_ns or 0) > last or (rule.until_ns is not None and rule.until_ns <= first):
             log.warning(
-                "%s: `%s` leaves nothing to capture: what is replayed of the recording goes from %s to %s",
-                rule.topic, key, time_text(first), time_text(last),
+                "%s: `at`, `from` or `until` leaves nothing to capture: what is replayed of the recording goes from"
+                " %s to %s", rule.topic, time_text(first), time_text(last),
             )

@@ -234,7 +234,7 @@ def test_what_is_no_condition_is_refused_with_a_sentence(text: str):
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("okay == true", "did you mean 'ok'"), ("ok == 1", "true or false, and compared with a number"),
+    ("okay == true", "has no field 'okay'; it has: ok, "), ("ok == 1", "true or false, and compared with a number"),
     ('ok == "true"', "compared with a string"), ("word == 1", "a string, and"), ("number == true", "a number, and"),
     ("parts == 1", "an array"), ("parts[0] == 1", "a message"), ("reals == 1", "an array"), ("blob[*] == 1", "bytes"),
     ("number[0] == 1", "nothing can be selected"),
@@ -276,4 +276,4 @@ def test_definitions_without_end_do_not_fill_the_memory_of_a_condition():
     for number in range(100):
         decoder = decoder_for(Wire.ROS1, f"a/msg/T{number}", "int32 x\n")
         box.look(RawMessage("/all", decoder.type_name, START, b"\0\0\0\0", decoder))
-    assert len(box._compiled) <= 64
+    assert box._compiled.cache_info().currsize <= 64

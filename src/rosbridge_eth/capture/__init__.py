@@ -11,13 +11,13 @@ from rosbridge_eth.capture.lines import (  # isort: skip
     stream_line, trigger_line,
 )  # fmt: skip
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage, Wire, decoder_for, decoder_for_known
-from rosbridge_eth.capture.process import Capture, Captured
+from rosbridge_eth.capture.process import Capture, Record
 from rosbridge_eth.capture.restoration import Restoration
 from rosbridge_eth.capture.rules import NamePattern, TopicRule
 
 __all__ = [
-    "Capture", "Captured", "Conversion", "DecodeError", "Decoder", "DefinitionError",
-    "LostLine", "MessageLine", "NamePattern", "RawMessage", "Restoration", "StreamLine", "TopicRule", "TriggerLine",
-    "TypeLine", "Wire", "decoder_for", "decoder_for_known", "definition_line", "normalised_type_name", "parse_line",
-    "read_definition", "stream_line", "trigger_line",
+    "Capture", "Conversion", "DecodeError", "Decoder", "DefinitionError",
+    "LostLine", "MessageLine", "NamePattern", "RawMessage", "Record", "Restoration", "StreamLine", "TopicRule",
+    "TriggerLine", "TypeLine", "Wire", "decoder_for", "decoder_for_known", "definition_line", "normalised_type_name",
+    "parse_line", "read_definition", "stream_line", "trigger_line",
 ]  # fmt: skip

@@ -21,7 +21,6 @@ array of numbers as on the wire (little-endian), any other array as its JSON.
 
 from __future__ import annotations
 
-import difflib
 from base64 import b64encode
 from collections.abc import Callable
 from math import inf, isfinite
@@ -34,7 +33,7 @@ from rosbags.interfaces.typing import FieldDesc
 
 from rosbridge_eth.capture.definitions import DURATION, TIME, attribute_name
 from rosbridge_eth.capture.messages import Decoder, Wire
-from rosbridge_eth.capture.rules import DEFAULT_LIMIT, OversizePolicy, Selection
+from rosbridge_eth.capture.rules import DEFAULT_LIMIT, Selection
 from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
 
@@ -46,24 +45,16 @@ NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
 }
 
 
-class FieldTooLarge(Exception):
-    """A field is above the limit and the policy is to refuse such messages."""
-
-
 class Conversion:
     """One type's compiled conversion. `convert(message)` gives the record's data.
 
     digested: how many fields a digest stood for, so far; last_digested: the latest of them.
     """
 
-    def __init__(
-        self, decoder: Decoder, selection: Selection = None, *, limit: int = DEFAULT_LIMIT,
-        oversize: OversizePolicy = "digest",
-    ) -> None:  # fmt: skip
+    def __init__(self, decoder: Decoder, selection: Selection = None, *, limit: int = DEFAULT_LIMIT) -> None:
         self._fields = decoder.fields
         self._ros1 = decoder.wire is Wire.ROS1
         self._limit = limit
-        self._refuse = oversize == "refuse"
         self.type_name = decoder.type_name
         self.digested = 0
         self.last_digested = ""
@@ -79,10 +70,8 @@ class Conversion:
             if isinstance(name, int) or name == "*":
                 raise ConfigError(f"field {path!r} of {self.type_name} is not an array")
             if name not in fields:
-                near = difflib.get_close_matches(name, fields, 1)
-                hint = f"did you mean {near[0]!r}?" if near else f"it has: {', '.join(fields) or 'no fields'}"
                 where = f"field {path!r} of {self.type_name}" if path else self.type_name
-                raise ConfigError(f"{where} has no field {name!r}; {hint}")
+                raise ConfigError(f"{where} has no field {name!r}; it has: {', '.join(fields) or 'no fields'}")
         members = []
         for name, description in fields.items():
             if selection is None or name in selection:
@@ -192,8 +181,6 @@ class Conversion:
         return convert
 
     def _too_large(self, path: str, content: bytes) -> dict[str, Any]:
-        if self._refuse:
-            raise FieldTooLarge(f"{path} has {len(content)} bytes")
         self.digested += 1
         self.last_digested = path
         return {"sm3": sm3.digest(content).hex(), "length": len(content)}

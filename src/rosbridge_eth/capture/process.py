@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final, NamedTuple
+from functools import lru_cache, partial
+from typing import Final, NamedTuple
 
 import orjson
 
-from rosbridge_eth.capture.conversion import Conversion, FieldTooLarge
-from rosbridge_eth.capture.lines import lost_line
+from rosbridge_eth.capture.conversion import Conversion
+from rosbridge_eth.capture.lines import definition_line, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
-from rosbridge_eth.capture.rules import NamePattern, Schedule, Selection, TopicRule, parse_paths, rule_for
+from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, parse_paths, rule_for
 from rosbridge_eth.chunk import MAX_ARCHIVED_LINE, MAX_LINE
 from rosbridge_eth.errors import ConfigError
 
@@ -35,7 +36,6 @@ class Cause(StrEnum):
 
     FIELD_DIGESTED = "field_digested"  # captured, with a digest in place of a large field
     FIELD_MISSING = "field_missing"
-    FIELD_TOO_LARGE = "field_too_large"
     RECORD_TOO_LARGE = "record_too_large"
     UNDECODABLE = "undecodable"
 
@@ -43,15 +43,13 @@ class Cause(StrEnum):
 _LOSSES: Final = frozenset(Cause) - {Cause.FIELD_DIGESTED}
 
 
-class Captured(NamedTuple):
-    """What became of a message: `line` is the record; data is JSON-ready, see conversion; the rest as in its rule."""
+class Record(NamedTuple):
+    """A line on its way to the writer. definition: as LogWriter.add takes it; trigger and archive: as in its rule."""
 
     topic: str
-    type_name: str
     received_ns: int
     line: bytes
-    decoder: Decoder
-    data: dict[str, Any]
+    definition: tuple[str, bytes] | None
     trigger: str | None = None
     archive: bool = False
 
@@ -59,9 +57,8 @@ class Captured(NamedTuple):
 @dataclass
 class _Topic:
     rule: TopicRule
-    selection: Selection
     schedule: Schedule
-    conversions: dict[Decoder, Conversion] = field(default_factory=dict)
+    conversion: Callable[[Decoder], Conversion]  # compiled once for each of MAX_CONVERSIONS; ConfigError
 
 
 class Capture:
@@ -70,8 +67,7 @@ class Capture:
     source_kind: stands in every line.
     live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
     that is an error of the configuration.
-    counts: messages so far by topic and what became of them: captured, not_due, or a Cause other than FIELD_DIGESTED,
-    which counts fields.
+    counts: messages so far that were left out, by topic and Cause; FIELD_DIGESTED counts fields.
     """
 
     def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
@@ -91,19 +87,16 @@ class Capture:
         self._topics = {name: topic for name, topic in self._topics.items()
                         if topic is not None and topic.rule == rule_for(name, self._rules)}  # fmt: skip
 
-    def process(self, raw: RawMessage, wall_ns: int, clock_synchronised: bool = False) -> Captured | None:
+    def process(self, raw: RawMessage, wall_ns: int, clock_synchronised: bool = False) -> Record | None:
         """The record of a message, or None if it is not due, refused or cannot be decoded.
 
         Raises ConfigError if the rule names a field that the message's type does not have, unless `live`.
         """
         topic = self._topic(raw.topic)
-        if topic is None:
-            return None
-        if not topic.schedule.due(raw.received_ns):
-            self.counts[raw.topic, "not_due"] += 1
+        if topic is None or not topic.schedule.due(raw.received_ns):
             return None
         try:
-            conversion = topic.conversions.get(raw.decoder) or self._compile(topic, raw.decoder)
+            conversion = topic.conversion(raw.decoder)
             digested_before = conversion.digested
             if not 0 <= raw.received_ns <= LAST_TIME:
                 raise DecodeError(f"its receive time is {raw.received_ns}")
@@ -114,9 +107,6 @@ class Capture:
             return self._left_out(raw, Cause.FIELD_MISSING, str(error))
         except DecodeError as error:
             return self._left_out(raw, Cause.UNDECODABLE, f"it cannot be decoded: {error}")
-        except FieldTooLarge as error:
-            why = f'{error}, more than {topic.rule.limit}; choose other fields, or oversize = "digest"'
-            return self._left_out(raw, Cause.FIELD_TOO_LARGE, why)
         line = orjson.dumps({
             "topic": raw.topic, "type": raw.type_name, "source": self._source_kind,
             "received_ns": raw.received_ns, "captured_ns": wall_ns, "clock": clock_synchronised, "data": data,
@@ -128,15 +118,14 @@ class Capture:
             text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
             self._count(raw.topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
         topic.schedule.captured(raw.received_ns)
-        self.counts[raw.topic, "captured"] += 1
-        rest = topic.rule.trigger, topic.rule.archive
-        return Captured(raw.topic, raw.type_name, raw.received_ns, line, raw.decoder, data, *rest)
+        definition = raw.type_name, definition_line(raw.decoder)
+        return Record(raw.topic, raw.received_ns, line, definition, topic.rule.trigger, topic.rule.archive)
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if the topic's rule does not fit the type."""
         state = self._topic(topic)
         if state is not None:
-            self._compile(state, decoder)
+            state.conversion(decoder)
 
     @property
     def lost(self) -> dict[tuple[str, str], int]:
@@ -152,17 +141,13 @@ class Capture:
     def _topic(self, name: str) -> _Topic | None:
         if name not in self._topics:
             rule = rule_for(name, self._rules)
-            self._topics[name] = None if rule is None else _Topic(rule, self._selections[rule], Schedule(rule))
+            self._topics[name] = None if rule is None else _Topic(
+                rule, Schedule(rule),
+                lru_cache(MAX_CONVERSIONS)(partial(Conversion, selection=self._selections[rule], limit=rule.limit)),
+            )  # fmt: skip
         return self._topics[name]
 
-    def _compile(self, topic: _Topic, decoder: Decoder) -> Conversion:
-        conversion = Conversion(decoder, topic.selection, limit=topic.rule.limit, oversize=topic.rule.oversize)
-        while len(topic.conversions) >= MAX_CONVERSIONS:
-            del topic.conversions[next(iter(topic.conversions))]
-        topic.conversions[decoder] = conversion
-        return conversion
-
-    def _left_out(self, raw: RawMessage, cause: Cause, why: str) -> Captured | None:
+    def _left_out(self, raw: RawMessage, cause: Cause, why: str) -> Record | None:
         """Count it; None is what became of it."""
         self._count(raw.topic, cause, f"a message is left out: {why}")
         return None

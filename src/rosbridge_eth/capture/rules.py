@@ -1,4 +1,4 @@
-"""What is captured of which topic: fields, rate, moment or period, oversize.
+"""What is captured of which topic: fields, rate, moment or period.
 
 All times are compared with a message's receive time, so a bag gives the same
 records at any replay speed. Field paths:
@@ -18,9 +18,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
-OversizePolicy: TypeAlias = Literal["digest", "refuse"]
 DEFAULT_LIMIT: Final = 16 * 1024
 """Bytes of one field from which on its digest stands for it."""
 ARCHIVE_LIMIT: Final = 12_000_000
@@ -38,7 +37,7 @@ class TopicRule:
     once: only the first message (of the period).
     from_ns, until_ns: only messages received in [from, until).
     for_ns: length of the period: from `from_ns`, or from the first message if that is None.
-    oversize, limit: what becomes of a field above `limit` bytes.
+    limit: bytes of a field above which its digest stands for it.
     trigger: records are kept in memory until this event; None: they are written.
     archive: the records go into chunks for the archive, and may be as long as fits one.
     """
@@ -51,7 +50,6 @@ class TopicRule:
     from_ns: int | None = None
     until_ns: int | None = None
     for_ns: int | None = None
-    oversize: OversizePolicy = "digest"
     limit: int = DEFAULT_LIMIT
     trigger: str | None = None
     archive: bool = False

@@ -222,16 +222,13 @@ class TriggerConfig(Section):
 class CaptureConfig(Section):
     """What holds for every topic.
 
-    oversize: What becomes of a field above `field_limit`: its SM3 digest and length are captured instead, or the
-    message is left out, which the log says. Both are counted, and said once per topic.
-
-    field_limit: Largest field that is captured as it is; of what goes into the archive that is always 12 MB.
+    field_limit: Largest field that is captured as it is, 12 MB of what goes into the archive; of a larger one its SM3
+    digest and length are captured, which the log says once per topic.
 
     store: Where records go: onto the chain, or into the operator's archive, with header and signature of their chunks
     on the chain (docs/howto-archive.md). That is for images and point clouds.
     """
 
-    oversize: Literal["digest", "refuse"] = "digest"
     field_limit: Annotated[int, size(high="48 KiB")] = 16 * KIB
     store: Store = "chain"
 
@@ -446,8 +443,7 @@ class RobotConfig(Section):
         return [
             TopicRule(
                 topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
-                topic.for_, self.capture.oversize, ARCHIVE_LIMIT if archive else self.capture.field_limit,
-                topic.trigger, archive,
+                topic.for_, ARCHIVE_LIMIT if archive else self.capture.field_limit, topic.trigger, archive,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
             for archive in [(topic.store or self.capture.store) == "archive"]

@@ -234,7 +234,7 @@ def test_a_type_that_nobody_knows_becomes_a_bag_of_any_kind(tmp_path: Path, kind
     decoder = decoder_for(Wire.ROS1, "fleet_msgs/Report", CUSTOM)
     wire = Wire.ROS1 if kind == "bag" else Wire.CDR
     capture = Capture([TopicRule("/t")], source_kind="ros1")
-    data = capture.process(RawMessage("/t", decoder.type_name, 0, CUSTOM_RAW, decoder), 0).data
+    data = parse_line(capture.process(RawMessage("/t", decoder.type_name, 0, CUSTOM_RAW, decoder), 0).line).data
     restoration = Restoration(parse_line(definition_line(decoder)).decoder(), wire)
     path = tmp_path / ("some.bag" if kind == "bag" else "some")
     plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3

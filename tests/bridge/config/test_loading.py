@@ -81,13 +81,12 @@ topics = [
     { topic = "/c/*", at = 1970-01-01T00:00:03Z },
 ]
 [capture]
-oversize = "refuse"
 field_limit = "2 KiB"
 """
     )
     rules = {rule.topic: rule for rule in config.rules()}
     assert list(rules) == ["/robot_1/imu", "/robot_1/odom", "/a", "/b", "/c/*", "**"]
-    assert all((rule.limit, rule.oversize) == (2048, "refuse") for rule in rules.values())
+    assert all(rule.limit == 2048 for rule in rules.values())
     odom = rules["/robot_1/odom"]
     assert (odom.fields, odom.rate) == (("pose.pose.position",), 2)
     assert (rules["/a"].from_ns, rules["/a"].until_ns) == (S, 2 * S)
@@ -143,8 +142,8 @@ MISTAKES = {
     'topics = ["/a"]\n[log]\nperiod = 1': "line 3: log.period is 1; write a duration with its unit, such as",
     'topics = ["/a"]\n[log]\ncompress = "no"': "line 3: log.compress is 'no'; it should be true or false",
     'topics = ["/a"]\n[capture]\nfield_limit = "1 MiB"': "field_limit is '1 MiB'; it should be at most '48 KiB'",
-    'topics = ["/a"]\n[capture]\noversize = "digst"': (
-        "capture.oversize is 'digst'; allowed: 'digest', 'refuse'; did you mean 'digest'?"
+    'topics = ["/a"]\n[capture]\nstore = "archiv"': (
+        "capture.store is 'archiv'; allowed: 'chain', 'archive'; did you mean 'archive'?"
     ),
     'topics = ["/a"]\n[source]\nkind = "ros1"\nmaster = "robot:11311"': "source.master is 'robot:11311'; write the",
     'topics = ["/a"]\n[source]\nkind = "ros1"\nhostname = "a:1"': "source.hostname is 'a:1'; write a name or an",

@@ -15,7 +15,7 @@ import pytest
 from bridge.chunks import chain as chunk_chain
 from bridge.operations.conftest import PASSWORD, Place
 from rosbridge_eth import chunk
-from rosbridge_eth.capture import Capture, TopicRule, definition_line
+from rosbridge_eth.capture import Capture, TopicRule
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.identity import load_identity
@@ -81,7 +81,7 @@ def replayed(place: Place, keys: Keyring, without: int | None = None) -> None:
     capture, source = Capture([TopicRule("**")], source_kind="bag"), BagSource(sample_bag(), Selection(["**/odom"]))
     found = [one for raw in source.messages() if (one := capture.process(raw, raw.received_ns))]
     source.close()
-    lines = [definition_line(found[0].decoder), *(one.line for n, one in enumerate(found) if n != without)]
+    lines = [found[0].definition[1], *(one.line for n, one in enumerate(found) if n != without)]
     owner, _ = load_identity(place.path / "reader", b"the reader's own words")
     written(place, keys, owner.encryption_key.public_key, [STREAM_LINE, *lines])
 

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources import BagSource, Offer, Selection
 
@@ -128,7 +128,7 @@ def test_every_format_gives_the_same_messages(bag):
     assert [message.received_ns for message in messages] == [START + tick * S // 2 for tick in range(10)]
     assert {message.type_name for message in messages} == {"my_pkg/msg/Custom", "std_msgs/msg/String"}
     capture = Capture([TopicRule("**")], source_kind="bag")
-    records = [capture.process(message, 0) for message in messages]
+    records = [parse_line(capture.process(message, 0).line) for message in messages]
     custom = records[0].data
     assert custom["header"].pop("seq", 0) == 0  # ROS 1 alone has it
     assert custom == EXPECTED
@@ -342,7 +342,7 @@ def test_a_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path, capl
             writer.write(text, START + number, raw)
     capture = Capture([TopicRule("/names")], source_kind="bag")
     records = [capture.process(message, 0) for message in replayed(path, "/names")]
-    assert [record and record.data["data"] for record in records] == ["hi", None, "ho"]
+    assert [record and parse_line(record.line).data["data"] for record in records] == ["hi", None, "ho"]
     assert caplog.text.count("it cannot be decoded") == len(caplog.records) == 1
 
 

@@ -11,14 +11,14 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from bridge.sources.values import value_at
-from rosbridge_eth.capture import Capture, TopicRule
+from rosbridge_eth.capture import Capture, TopicRule, parse_line
 from rosbridge_eth.sources import BagSource, Offer, Selection, sample_bag
 
 
 def records(topic: str):
     capture = Capture([TopicRule(topic)], source_kind=BagSource.kind)
     source = BagSource(sample_bag(), Selection([topic]))
-    return [capture.process(message, 0) for message in source.messages()]
+    return [parse_line(capture.process(message, 0).line) for message in source.messages()]
 
 
 def test_what_was_recorded():

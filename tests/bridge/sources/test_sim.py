@@ -80,7 +80,7 @@ def test_messages_are_odometry_and_imu_that_capture_understands():
     source.run(emitted.append, threading.Event())
     assert len(emitted) == 60
     capture = Capture([TopicRule("**")], source_kind=source.kind)
-    records = [capture.process(message, 0) for message in emitted]
+    records = [parse_line(capture.process(message, 0).line) for message in emitted]
     odometry = [record for record in records if record.topic == "/robot_1/odom"]
     assert [record.type_name for record in odometry] == ["nav_msgs/msg/Odometry"] * 30
     motions = list(islice(drive(1, 10.0), 30))
@@ -90,7 +90,7 @@ def test_messages_are_odometry_and_imu_that_capture_understands():
         orientation = value_at(record.data, "pose.pose.orientation")
         assert 2 * math.atan2(orientation["z"], orientation["w"]) == pytest.approx(motion.heading)
     # No reader can take it for the record of a robot.
-    assert all(parse_line(record.line).source == "sim" for record in records)
+    assert all(record.source == "sim" for record in records)
     imu = records[0]
     assert imu.type_name == "sensor_msgs/msg/Imu"
     assert value_at(imu.data, "linear_acceleration.z") == pytest.approx(9.80665)

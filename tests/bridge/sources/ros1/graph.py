@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ports import free_port
-from rosbridge_eth.capture import Capture, RawMessage, TopicRule
+from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
 from rosbridge_eth.sources import Selection
 from rosbridge_eth.sources.ros1 import Ros1Source
 from rosbridge_eth.sources.ros1.publisher import Cause
@@ -142,7 +142,7 @@ class Listening:
         if record is None:
             assert self._tolerant, f"{raw.topic} cannot be captured"
             return
-        self.data.setdefault(raw.topic, []).append(record.data)
+        self.data.setdefault(raw.topic, []).append(parse_line(record.line).data)
 
     def count(self, topic: str) -> int:
         return len(self.data.get(topic, ()))

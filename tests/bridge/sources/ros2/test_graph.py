@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from bridge.sources.ros2.graph import Graph
-from rosbridge_eth.capture import Capture, TopicRule
+from rosbridge_eth.capture import Capture, TopicRule, parse_line
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
@@ -109,7 +109,7 @@ def test_the_same_odometry_gives_the_same_record_from_ros_1_and_ros_2(ros: Graph
     """The sample bag was recorded by ROS 1; its Odometry is published again by ROS 2."""
     source = BagSource(sample_bag(), Selection(["/robot_1/odom"]), speed=None)
     capture = Capture([TopicRule("/robot_1/odom")], source_kind=source.kind)
-    from_ros1 = [capture.process(raw, 0).data for raw in itertools.islice(source.messages(), 20)]
+    from_ros1 = [parse_line(capture.process(raw, 0).line).data for raw in itertools.islice(source.messages(), 20)]
     for data in from_ros1:
         del data["header"]["seq"]  # which only ROS 1 has
     node = ros.node("/base")

@@ -18,11 +18,10 @@ from pathlib import Path
 
 from rosbridge_eth.capture import (
     Capture,
-    Captured,
     Conversion,
     RawMessage,
+    Record,
     Restoration,
-    definition_line,
     parse_line,
 )
 from rosbridge_eth.config import load_robot_config
@@ -40,12 +39,13 @@ def say(value: dict[str, object]) -> None:
     print(json.dumps(value), flush=True)
 
 
-def rebuilt(captured: Captured) -> bool:
+def rebuilt(record: Record) -> bool:
     """Whether a reader who has the lines alone gets this message from them, as far as it was captured."""
-    restoration = Restoration(parse_line(definition_line(captured.decoder)).decoder())
-    restored = restoration.restore(parse_line(captured.line).data)
+    data = parse_line(record.line).data
+    restoration = Restoration(parse_line(record.definition[1]).decoder())
+    restored = restoration.restore(data)
     again = restoration.decoder.decode(restoration.decoder.encode(restored.message))
-    return bool(restored.missing) or Conversion(restoration.decoder).convert(again) == captured.data
+    return bool(restored.missing) or Conversion(restoration.decoder).convert(again) == data
 
 
 def emit(raw: RawMessage) -> None:
