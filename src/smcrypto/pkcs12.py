@@ -152,13 +152,12 @@ def load(data: BytesLike, password: BytesLike) -> Contents:
         raise InvalidKey(_WRONG) from None
     except InvalidEncoding as error:
         raise InvalidKey(f"not a PKCS#12 file: {error}") from None
-    entries: list[Entry] = []
-    for key, name in keys:
-        own = next((c for c in certificates if c.public_key == key.public_key), None)
-        if own is not None:
-            certificates.remove(own)
-        entries.append(Entry(key, own, name))
-    return Contents(tuple(entries), tuple(certificates))
+    of_key: dict[sm2.PublicKey, list[Certificate]] = {}
+    for certificate in reversed(certificates):
+        of_key.setdefault(certificate.public_key, []).append(certificate)
+    entries = tuple(Entry(key, own.pop() if (own := of_key.get(key.public_key)) else None, name) for key, name in keys)
+    used = {id(entry.certificate) for entry in entries}
+    return Contents(entries, tuple(c for c in certificates if id(c) not in used))
 
 
 # --- the integrity of the whole ---

@@ -86,6 +86,9 @@ def test_init_does_not_overwrite(fleet: Path, capsys: pytest.CaptureFixture[str]
 def test_an_unencrypted_ca_on_purpose(folder: Path) -> None:
     run("init", "--dir", "lab", "--subject", "CN=Lab", "--unencrypted")
     assert sm2.PrivateKey.from_pem(Path("lab/ca.key.pem").read_bytes())
+    with pytest.raises(SystemExit, match="2"):  # a password that would not be used
+        run("init", "--dir", "other", "--subject", "CN=Lab", "--unencrypted", *PASSWORD)
+    assert not Path("other").exists()
 
 
 def test_a_failed_init_leaves_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

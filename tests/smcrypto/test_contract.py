@@ -456,6 +456,8 @@ WRONG_TYPES = [
         root, v, revoked=[], this_update=NOW, next_update=NOW, number=1), [b"", None, public]),
     ("crl revoked", lambda v: x509.CertificateRevocationList.create(
         root, root_key, revoked=[v], this_update=NOW, next_update=NOW, number=1), [b"", None, 5]),
+    ("crl find", crl.find, ["1", b"1", 1.0, True, None, leaf]),
+    ("name get", leaf.subject.get, [b"CN", 5, None, ["CN"]]),
     ("crl number", lambda v: x509.CertificateRevocationList.create(
         root, root_key, revoked=[], this_update=NOW, next_update=NOW, number=v), ["1", True, None]),
 ]  # fmt: skip

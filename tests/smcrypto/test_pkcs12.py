@@ -70,6 +70,15 @@ def test_both_pairs_of_an_identity(prf: Any) -> None:
     assert load(alone, PASSWORD) == Contents((Entry(other),), ())
 
 
+def test_a_key_that_is_there_twice_has_its_certificates_in_their_order() -> None:
+    renewed = x509.self_signed(KEY, subject={"CN": "renewed"}, not_before=NOW, not_after=NOW + timedelta(99))
+    entries = (Entry(KEY, LEAF, "old"), Entry(ROOT_KEY, None, None), Entry(KEY, renewed, "new"))
+    others = (renewed, ROOT, LEAF)
+    found = load(dump(entries, PASSWORD, others=others, **FAST), PASSWORD)
+    # a certificate beside its key is that key's, whoever wrote it down as another one
+    assert found == Contents((entries[0], Entry(ROOT_KEY, ROOT), entries[2]), (renewed, LEAF))
+
+
 @pytest.mark.parametrize("call, error", [
     (lambda: dump([], b"p"), InvalidOption),
     (lambda: dump([Entry(KEY)], b""), InvalidOption),

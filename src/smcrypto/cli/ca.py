@@ -54,11 +54,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_subject(init)
     _add_days(init, 3650)
     init.add_argument("--path-length", type=int, metavar="N", help="at most N intermediate CAs below (default: any)")
-    init.add_argument("--unencrypted", action="store_true", help="write the CA's key without a password")
     add_prf(init)
     init.add_argument("--force", action="store_true", help="overwrite an existing CA")
     add_uid(init)
-    passwords.add_arguments(init)
+    passwords.add_arguments(init).add_argument("--unencrypted", action="store_true",
+                                               help="write the CA's key without a password")
     init.set_defaults(run=run_init)
 
     csr = commands.add_parser("csr", help="make a certificate signing request for a key")

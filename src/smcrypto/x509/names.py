@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from smcrypto import der
 from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
+from smcrypto.inputs import require_type
 
 __all__ = ["Attribute", "Name"]
 
@@ -96,7 +97,7 @@ class Name:
         if not all(self._rdns):
             raise InvalidOption("a relative distinguished name needs an attribute")
         self._der = der.sequence(*(der.set_of(*map(_encode_attribute, rdn)) for rdn in self._rdns))
-        self._key: tuple[frozenset[tuple[str, bytes | str]], ...] | None = None
+        self._key: tuple[tuple[int, frozenset[tuple[str, bytes | str]]], ...] | None = None
 
     @classmethod
     def build(cls, subject: Name | str | Mapping[str, str] | Iterable[tuple[str, str]]) -> Name:
@@ -150,6 +151,7 @@ class Name:
 
     def get(self, kind: str) -> str | None:
         """The text of the last attribute of type `kind` ("CN", or a dotted identifier), None if there is none."""
+        require_type(kind, str, "kind")
         oid, _, _ = _BY_NAME.get(kind.lower(), (kind, 0, 0))
         return next((a.text for a in reversed(self.attributes) if a.oid == oid), None)
 
@@ -161,11 +163,10 @@ class Name:
         """RFC 4514, 2: the last relative name first; what could mislead a reader is escaped."""
         return ",".join("+".join(_print_attribute(a) for a in rdn) for rdn in reversed(self._rdns))
 
-    def _comparable(self) -> tuple[frozenset[tuple[str, bytes | str]], ...]:
+    def _comparable(self) -> tuple[tuple[int, frozenset[tuple[str, bytes | str]]], ...]:
         if self._key is None:
-            self._key = tuple(
-                frozenset((a.oid, a.value if a.text is None else _fold(a.text)) for a in rdn) for rdn in self._rdns
-            )
+            folded = ([(a.oid, a.value if a.text is None else _fold(a.text)) for a in rdn] for rdn in self._rdns)
+            self._key = tuple((len(rdn), frozenset(rdn)) for rdn in folded)
         return self._key
 
     def __bool__(self) -> bool:
@@ -220,8 +221,8 @@ def _pair(pair: tuple[str, str]) -> tuple[str, str]:
 
 
 def _attribute(kind: str, text: str) -> Attribute:
-    if not isinstance(kind, str) or not isinstance(text, str):
-        raise TypeError("a name's types and values must be str")
+    require_type(kind, str, "a name's type")
+    require_type(text, str, "a name's value")
     oid, bound, tag = _BY_NAME.get(kind.lower(), (kind, 32768, der.UTF8_STRING))
     try:
         der.oid(oid)

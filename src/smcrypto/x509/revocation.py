@@ -130,7 +130,7 @@ class CertificateRevocationList(Signed):
 
     def find(self, serial_number: int) -> RevokedCertificate | None:
         """The entry for a certificate of this issuer, None if it is not revoked."""
-        return self._by_serial.get(serial_number)
+        return self._by_serial.get(require_int(serial_number, "serial_number"))
 
     def verify(self, issuer: Certificate, *, uid: BytesLike = sm2.DEFAULT_UID) -> None:
         """CertificateError unless `issuer` may sign revocation lists and signed this one under `uid`."""

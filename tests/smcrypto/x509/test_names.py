@@ -244,6 +244,11 @@ def test_other_names_are_not_equal(other: dict[str, str]) -> None:
     assert Name.build({"CN": "robot one"}) != Name.build(other)
 
 
+def test_a_relative_name_of_two_attributes_is_not_one_of_one() -> None:
+    one, two = Name.build("CN=robot"), Name.build("CN=robot+CN=Robot")  # "the same number", RFC 5280, 7.1
+    assert one != two and two == Name.build("CN=ROBOT+CN=robot")
+
+
 def test_order_of_relative_names_counts() -> None:
     assert Name.build([("CN", "a"), ("O", "b")]) != Name.build([("O", "b"), ("CN", "a")])
     assert Name.build({"CN": "STRASSE"}) != Name.build({"CN": "Straße"})
