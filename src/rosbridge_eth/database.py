@@ -102,13 +102,11 @@ class Database:
                 found, version = application, VERSION
             if found != application:
                 raise StoreError(f"{self.path} is no {self._what}; name another file")
-            if version < VERSION:
+            if version != VERSION:
                 raise StoreError(
-                    f"the {self._what} {self.path} is of the first edition, whose records have another format;"
-                    " finish with that edition what it holds, then move it away"
+                    f"the {self._what} {self.path} has version {version}, this program knows {VERSION} (the first"
+                    " edition had 1): finish what it holds with the edition that wrote it, then move it away"
                 )
-            if version > VERSION:
-                raise StoreError(f"the {self._what} {self.path} has version {version}; this program knows {VERSION}")
             if not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA wal_autocheckpoint = {self._wal_pages}")

@@ -95,7 +95,7 @@ class Sender:
         if not self.statistics.connected or self._asked:
             return
         if self._stream is None:
-            self._ask(self._spool.first_unconfirmed())
+            self._ask(self._spool.next_stream(b""))
             return
         if not self._client.writable() or not self._send_parts() or sum(self._flying.values()) > AHEAD:
             return

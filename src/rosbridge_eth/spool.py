@@ -112,8 +112,6 @@ class Spool:
     def append(self, chunk: Chunk) -> None:
         """Add the next chunk of the log. DiskFull where even the removal of old ones makes no room for it."""
         size = len(chunk.encoded)
-        if size > self._max_bytes:
-            raise StoreError(f"a chunk of {size} bytes is larger than the whole spool; raise [spool] max_size")
         try:
             self._db.write(lambda: self._append(chunk, size, spare=0))
         except DiskFull:
@@ -157,12 +155,10 @@ class Spool:
                 (bool(chunk.body), state != _WHOLE, chunk.header.records if chunk.body else 0),
             )
 
-    def first_unconfirmed(self) -> tuple[bytes, int, bytes] | None:
-        """Stream, number and digest of the oldest chunk that is not set aside."""
-        return self.next_stream(b"")
-
     def next_stream(self, stream: bytes) -> tuple[bytes, int, bytes] | None:
-        """The same of the stream that begins after this one; of the oldest other one if this one is not here."""
+        """Stream, number and digest of the oldest chunk that is not set aside, of the streams that begin after this
+        one; of all others if this one is not here, such as b"".
+        """
         following = (
             "SELECT stream, number, digest FROM chunk WHERE state != ? AND stream != ? AND position >"
             " (SELECT coalesce(max(position), 0) FROM chunk WHERE stream = ?) ORDER BY position LIMIT 1"

@@ -138,11 +138,6 @@ class Submitter:
         self.gas: Counter[bytes] = Counter()  # that the transactions sent for each robot use
         self.counts: Counter[str] = Counter()
 
-    @property
-    def in_flight(self) -> int:
-        """Transactions that are sent and in no block yet."""
-        return sum(len(account.flights) for account in self._known.values())
-
     def turn(self, now: float) -> float:
         """now: seconds since 1970. Seconds until the next turn is wanted. StoreError of the inbox passes through."""
         try:

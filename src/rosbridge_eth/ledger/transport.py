@@ -62,12 +62,11 @@ class OutOfFunds(ChainError):
 
 
 class Reverted(ChainError):
-    """The contract refuses. `name` is its error, '' where it gave none; `arguments` are that error's values."""
+    """The contract refuses. `name` is its error, '' where it gave none."""
 
-    def __init__(self, message: str, name: str = "", arguments: tuple[Any, ...] = ()) -> None:
+    def __init__(self, message: str, name: str = "") -> None:
         super().__init__(message)
         self.name = name
-        self.arguments = arguments
 
 
 TABLE: tuple[tuple[type[ChainError], str], ...] = (
@@ -295,7 +294,7 @@ class Node:
                     values = decode(types, code[4:])
                     named = zip((entry["name"] for entry in item["inputs"]), values, strict=True)
                     words = ", ".join(f"{n} 0x{v.hex()}" if isinstance(v, bytes) else f"{n} {v}" for n, v in named)
-                    return Reverted(f"the contract refuses: {item['name']}({words})", item["name"], values)
+                    return Reverted(f"the contract refuses: {item['name']}({words})", item["name"])
         except (DecodingError, ValueError):
             pass
         return None

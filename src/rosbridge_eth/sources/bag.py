@@ -25,7 +25,6 @@ from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Selection, Source
 
 log = logging.getLogger(__name__)
 
-_BAGS = "a .bag, .mcap or .db3 file or the folder of a ROS 2 bag"
 MAX_WAIT_NS = 3600 * 10**9
 """A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
 
@@ -51,13 +50,11 @@ class BagSource(Source):
         self._reader: Rosbag1Reader | Rosbag2Reader | None = None
         if not path.exists():
             raise SourceError(f"{self._where} does not exist")
-        if path.is_dir() and not (path / "metadata.yaml").exists():
+        if not ((path / "metadata.yaml").exists() if path.is_dir() else path.suffix in (".bag", ".mcap", ".db3")):
             raise SourceError(
-                f"{self._where} is a folder without metadata.yaml, so no ROS 2 bag; name {_BAGS}, or let"
-                " `ros2 bag reindex` restore a metadata.yaml that was lost"
+                f"{self._where} is no bag; name a .bag, .mcap or .db3 file or the folder of a ROS 2 bag with its"
+                " metadata.yaml, which `ros2 bag reindex` restores"
             )
-        if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
-            raise SourceError(f"{self._where} is no bag by its name; name {_BAGS}")
         with self._translated():
             reader = Rosbag1Reader(path) if self._wire is Wire.ROS1 else Rosbag2Reader(path)
             reader.open()
@@ -203,9 +200,6 @@ class BagSource(Source):
 def sample_bag() -> Path:
     """The bag that ships with the package: /robot_1/odom and /robot_1/imu of a robot that drives a figure eight.
 
-    How it was recorded is told in samples/README.md of the repository. Raises SourceError.
+    How it was recorded is told in samples/README.md of the repository.
     """
-    path = Path(str(files("rosbridge_eth") / "samples" / "robot_1.bag"))
-    if not path.is_file():
-        raise SourceError(f"the sample bag {path} is missing: the package is not completely installed")
-    return path
+    return Path(str(files("rosbridge_eth") / "samples" / "robot_1.bag"))

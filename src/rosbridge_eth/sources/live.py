@@ -16,7 +16,6 @@ from collections.abc import Mapping
 from typing import Final
 
 from rosbridge_eth.capture import RawMessage
-from rosbridge_eth.errors import SourceError
 from rosbridge_eth.sources.protocol import Clock, Emit, Selection, Source
 
 log = logging.getLogger(__name__)
@@ -73,8 +72,6 @@ class LiveSource(Source):
 
         `emit` may block for as long as it likes: what then finds no room is dropped.
         """
-        if self._receiving.ident is not None or self._ending.is_set():
-            raise SourceError("a live source runs once")
         self._receiving.start()
         try:
             while not stop.is_set():

@@ -39,14 +39,10 @@ class Motion(NamedTuple):
 
 
 def advance(motion: Motion, speed: float, turn: float, dt: float) -> Motion:
-    """Drive for `dt` at a constant speed and turn rate: an arc, or a line where the turn rate vanishes."""
+    """Drive for `dt` along an arc, at a constant speed and turn rate, which is not 0."""
     heading = motion.heading + turn * dt
-    if abs(turn) < 1e-9:
-        x = motion.x + speed * dt * math.cos(motion.heading)
-        y = motion.y + speed * dt * math.sin(motion.heading)
-    else:
-        x = motion.x + speed / turn * (math.sin(heading) - math.sin(motion.heading))
-        y = motion.y - speed / turn * (math.cos(heading) - math.cos(motion.heading))
+    x = motion.x + speed / turn * (math.sin(heading) - math.sin(motion.heading))
+    y = motion.y - speed / turn * (math.cos(heading) - math.cos(motion.heading))
     return Motion(x, y, math.remainder(heading, math.tau), speed, turn)
 
 

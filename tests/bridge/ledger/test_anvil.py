@@ -67,7 +67,6 @@ def test_chunks_get_there_and_are_confirmed(ledger: Ledger, tmp_path: Path):
 def test_the_nodes_refusals_are_understood(ledger: Ledger, node: Anvil):
     with pytest.raises(Reverted) as caught:
         ledger.revoke_robot(ROBOT, TK)
-    assert (caught.value.name, caught.value.arguments) == ("NotOperator", (ROBOT.address.lower(),))
     assert str(caught.value) == f"the contract refuses: NotOperator(sender {ROBOT.address.lower()})"
     node.ask("evm_setAutomine", False)
     [(nonce, _)] = ledger.nonces([OPERATOR.address])
@@ -144,7 +143,7 @@ def test_dropped_and_reorganised_transactions_are_sent_again(ledger: Ledger, nod
     node.ask("evm_setAutomine", False)
     world.take(world.pen.chunks(20, 8_000))
     world.turn()
-    assert world.submitter.in_flight == 2
+    assert world.in_flight == 2
     node.ask("anvil_dropAllTransactions")
     world.turn()
     node.ask("anvil_mine", "0x1")

@@ -67,7 +67,7 @@ def test_a_node_without_old_states_confirms_nothing_and_says_so(tmp_path: Path):
 def test_batches_are_full_and_one_is_not(world: World):
     world.take(world.pen.chunks(200, 8_000))
     world.turn()
-    assert world.submitter.in_flight == IN_FLIGHT
+    assert world.in_flight == IN_FLIGHT
     sizes = [sum(map(len, tx.call[4])) for tx in world.model.pool[ROBOT].values()]
     assert all(BATCH_BYTES - 9_000 < size <= BATCH_BYTES for size in sizes)
     world.run()
@@ -480,7 +480,7 @@ def test_what_a_robot_had_in_flight_when_it_was_revoked_takes_no_room_from_other
     revoked, fine = world.pens
     world.take(revoked.chunks(120, 8_000), revoked)
     world.turn()
-    assert world.submitter.in_flight == IN_FLIGHT
+    assert world.in_flight == IN_FLIGHT
     standings = world.model.state.standings
     standings[revoked.tk] = standings[revoked.tk]._replace(revoked=True)
     world.model.drop()
@@ -489,7 +489,7 @@ def test_what_a_robot_had_in_flight_when_it_was_revoked_takes_no_room_from_other
         world.turn(mine=1)
     world.turn()
     assert world.on_chain(fine) == fine.digests
-    assert world.submitter.in_flight == 0
+    assert world.in_flight == 0
 
 
 def test_a_refusal_costs_one_transaction_and_then_nothing(world: World):

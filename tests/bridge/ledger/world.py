@@ -88,6 +88,11 @@ class World:
         assert self.chain is not None
         return self.chain
 
+    @property
+    def in_flight(self) -> int:
+        """Transactions that are sent and in no block yet."""
+        return sum(len(account.flights) for account in self.submitter._known.values())
+
     def new_inbox(self, path: Path | None = None) -> SqliteInbox:
         """An empty one, or the one at `path`, and a submitter that begins with it."""
         self.inboxes += 1
