@@ -551,6 +551,8 @@ REFUSED = [
     (smcrypto.InvalidOption, lambda: x509.verify_chain(leaf, roots=[root], at=datetime.min.replace(tzinfo=EAST))),
     (smcrypto.InvalidOption, lambda: x509.self_signed(key, subject={"CN": "x"}, not_before=NOW, not_after=LATEST)),
     (smcrypto.InvalidOption, lambda: x509.self_signed(key, subject={"CN": "x"}, not_before=LATEST, not_after=NOW)),
+    (smcrypto.InvalidOption, lambda: x509.self_signed(
+        key, subject={"CN": "x"}, **VALID, extensions=[x509.Extension("1.x", False, b"")])),
     # what the peer sent
     *((smcrypto.InvalidSignature, lambda s=s, e=e: public.verify(s, b"m", encoding=e))
       for s in (b"", b"0", bytes(64), bytes(72), b"\xff" * 64) for e in ("der", "raw")),

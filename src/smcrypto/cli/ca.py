@@ -33,10 +33,7 @@ examples:
   python -m smcrypto ca revoke --dir fleet --password-file ca.pass --reason keyCompromise robot.crt.pem
 """
 
-PURPOSES = {
-    "sign": x509.SIGNING_KEY_USAGE,
-    "encrypt": x509.ENCRYPTION_KEY_USAGE,
-}
+PURPOSES = {"sign": x509.SIGNING_KEY_USAGE, "encrypt": x509.ENCRYPTION_KEY_USAGE}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -23,9 +23,7 @@ from smcrypto.errors import InvalidCiphertext, InvalidOption
 
 __all__ = ["add_parser"]
 
-MODES: dict[str, Callable[[bytes], sm4.Mode]] = {
-    "cbc": sm4.CBC, "ctr": sm4.CTR, "cfb": sm4.CFB, "ofb": sm4.OFB,
-}
+MODES: dict[str, Callable[[bytes], sm4.Mode]] = {"cbc": sm4.CBC, "ctr": sm4.CTR, "cfb": sm4.CFB, "ofb": sm4.OFB}
 MAGIC = b"Salted__"
 SALT_SIZE = 8
 DEFAULT_ITERATIONS = 100_000

@@ -20,10 +20,8 @@ __all__ = ["add_arguments", "named", "read_password"]
 def add_arguments(parser: argparse.ArgumentParser) -> argparse._MutuallyExclusiveGroup:
     """The options that name a password; of the group that is returned one can be given."""
     group = parser.add_mutually_exclusive_group()
-    group.add_argument("--password-file", type=Path, metavar="FILE",
-                       help="read the password from FILE's first line")
-    group.add_argument("--password-env", metavar="NAME",
-                       help="read the password from the environment variable NAME")
+    group.add_argument("--password-file", type=Path, metavar="FILE", help="read the password from FILE's first line")
+    group.add_argument("--password-env", metavar="NAME", help="read the password from the environment variable NAME")
     return group
 
 

@@ -526,9 +526,7 @@ def write_pbes2(data: bytes, password: bytes, prf: Prf, iterations: int) -> tupl
     else:
         function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
         key = _pbkdf2("sha256", password, salt, iterations, 16)
-    derivation = der.sequence(
-        der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function)
-    )
+    derivation = der.sequence(der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function))
     cipher = der.sequence(der.oid(_SM4_CBC), der.octet_string(iv))
     algorithm = der.sequence(der.oid(_PBES2), der.sequence(derivation, cipher))
     return algorithm, sm4.encrypt(key, sm4.CBC(iv), data, padding="pkcs7")

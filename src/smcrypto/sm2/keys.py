@@ -203,9 +203,7 @@ class PublicKey:
         """
         encryption.require_encoding(encoding)
         data = as_bytes(message, "message")
-        nonces = hedged_nonces(
-            self._curve.n, b"SM2 encryption", self.to_bytes(compressed=True), sm3.digest(data)
-        )
+        nonces = hedged_nonces(self._curve.n, b"SM2 encryption", self.to_bytes(compressed=True), sm3.digest(data))
         return encryption.encode_ciphertext(
             *encryption.encrypt(self._curve, self._point, data, nonces), self._curve, encoding
         )
@@ -421,9 +419,7 @@ class PrivateKey:
             self._d, self.public_key._standard_bytes(), _password(password), format, form=form, prf=prf
         )
 
-    def sign(
-        self, message: BytesLike, *, uid: BytesLike = DEFAULT_UID, encoding: SignatureEncoding = "der"
-    ) -> bytes:
+    def sign(self, message: BytesLike, *, uid: BytesLike = DEFAULT_UID, encoding: SignatureEncoding = "der") -> bytes:
         """This key's signature of `message` (GB/T 32918.2, 6).
 
         uid: the signer's distinguishing identifier, at most 8191 bytes (InvalidLength); may be empty.

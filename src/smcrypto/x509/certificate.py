@@ -86,9 +86,7 @@ class Certificate(Signed):
         """The bytes that the signature covers."""
         return self._body
 
-    def verify_signature(
-        self, issuer: Certificate | sm2.PublicKey, *, uid: BytesLike = sm2.DEFAULT_UID
-    ) -> None:
+    def verify_signature(self, issuer: Certificate | sm2.PublicKey, *, uid: BytesLike = sm2.DEFAULT_UID) -> None:
         """CertificateError unless `issuer`'s key made this signature. Nothing else is checked: see `verify_chain`."""
         key = issuer.public_key if isinstance(issuer, Certificate) else issuer
         require_type(key, sm2.PublicKey, "issuer")

@@ -165,9 +165,7 @@ class _Search:
                 return None
         return path
 
-    def refused(
-        self, path: tuple[Certificate, ...], error: CertificateError, *, came: float | None = None
-    ) -> None:
+    def refused(self, path: tuple[Certificate, ...], error: CertificateError, *, came: float | None = None) -> None:
         came = len(path) if came is None else came
         if came > self.refusal[0]:
             self.refusal = (came, error)

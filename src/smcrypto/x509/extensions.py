@@ -13,9 +13,9 @@ from ipaddress import ip_address
 from typing import Final
 
 from smcrypto import der, sm3
-from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
+from smcrypto.errors import CertificateError, InvalidOption
 from smcrypto.inputs import as_bytes, require_int, require_type
-from smcrypto.x509.names import Name
+from smcrypto.x509.names import Name, written_oid
 
 __all__ = [
     "AUTHORITY_KEY_IDENTIFIER",
@@ -91,7 +91,8 @@ class Extension:
         """Extension ::= SEQUENCE { extnID, critical, extnValue } (RFC 5280, 4.1)."""
         # DER leaves out a critical that is FALSE, its default (X.690, 11.5).
         flag = der.boolean(True) if self.critical else b""
-        return der.sequence(der.oid(self.oid), flag, der.octet_string(self.value))
+        oid = written_oid(self.oid, f"an extension's oid must be a dotted object identifier, not {self.oid!r}")
+        return der.sequence(oid, flag, der.octet_string(self.value))
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,12 +208,7 @@ def read_extended_key_usage(value: bytes) -> tuple[str, ...]:
 def usage_oid(purpose: str) -> str:
     """The identifier of a purpose given by name ("serverAuth") or as a dotted identifier."""
     oid = _PURPOSES.get(purpose, purpose)
-    try:
-        der.oid(oid)
-    except InvalidEncoding:
-        raise InvalidOption(
-            f"unknown extended key usage {purpose!r}; a dotted object identifier names any other"
-        ) from None
+    written_oid(oid, f"unknown extended key usage {purpose!r}; a dotted object identifier names any other")
     return oid
 
 

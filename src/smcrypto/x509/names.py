@@ -16,7 +16,7 @@ from smcrypto import der
 from smcrypto.errors import CertificateError, InvalidEncoding, InvalidOption
 from smcrypto.inputs import require_type
 
-__all__ = ["Attribute", "Name"]
+__all__ = ["Attribute", "Name", "written_oid"]
 
 # Attribute types: short name (RFC 4514, 3, and OpenSSL's for the rest), identifier,
 # upper bound in characters on writing (RFC 5280, appendix A.1), string type on writing.
@@ -214,6 +214,14 @@ def _read_attribute(reader: der.Reader) -> Attribute:
     return Attribute(oid, value, text)
 
 
+def written_oid(dotted: str, problem: str) -> bytes:
+    """The object identifier in DER; InvalidOption, saying `problem`, if it is none."""
+    try:
+        return der.oid(dotted)
+    except InvalidEncoding:
+        raise InvalidOption(problem) from None
+
+
 def _pair(pair: tuple[str, str]) -> tuple[str, str]:
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise TypeError(f"a name is made of pairs of type and value, not of {pair!r}")
@@ -224,10 +232,7 @@ def _attribute(kind: str, text: str) -> Attribute:
     require_type(kind, str, "a name's type")
     require_type(text, str, "a name's value")
     oid, bound, tag = _BY_NAME.get(kind.lower(), (kind, 32768, der.UTF8_STRING))
-    try:
-        der.oid(oid)
-    except InvalidEncoding:
-        raise InvalidOption(f"unknown attribute type {kind!r}; a dotted object identifier names any other") from None
+    written_oid(oid, f"unknown attribute type {kind!r}; a dotted object identifier names any other")
     if not 1 <= len(text) <= bound or (oid == _COUNTRY and len(text) != 2):
         limits = "exactly 2" if oid == _COUNTRY else f"1 to {bound}"
         raise InvalidOption(f"a name's {kind} must have {limits} characters, not {len(text)}")

@@ -72,9 +72,7 @@ class CertificateSigningRequest(Signed):
         if wanted:
             extensions = der.sequence(*(e.to_der() for e in wanted))
             attributes.append(der.sequence(der.oid(_EXTENSION_REQUEST), der.set_of(extensions)))
-        body = der.sequence(
-            der.integer(0), name.to_der(), key.public_key.to_der(), der.explicit(0, *attributes)
-        )
+        body = der.sequence(der.integer(0), name.to_der(), key.public_key.to_der(), der.explicit(0, *attributes))
         request = cls.from_der(sign(body, key, as_bytes(uid, "uid")))
         request._fill(verified=True)
         return request
