@@ -311,8 +311,8 @@ class Verifier:
         knows_none = not same_stream and header.number == 0 and header.previous == NO_DIGEST
         breaks = ahead != 0 or not (follows or knows_none)
         self._broken = self._broken or breaks
-        # In an unbroken log nothing can be there twice; after a break, what follows may have been read before it.
-        known = self.links.index_of(header.digest) if self._broken else None
+        # In an unbroken log what names the one before it cannot be there twice; after a break it can.
+        known = self.links.index_of(header.digest) if self._broken or knows_none else None
         if known is not None:
             raise Refused(Kind.FORKED, f"the chunk of index {known} once more")
         if breaks:

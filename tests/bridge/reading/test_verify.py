@@ -345,6 +345,17 @@ def test_a_chunk_that_is_written_twice_is_told_and_given_once(again):
     assert result.numbers == [0, 1, 2, 3, 4]
 
 
+@pytest.mark.parametrize("again", [1, 2])
+def test_a_log_s_beginning_that_is_written_again_is_no_restart(again):
+    """It names nothing before it, as the first chunk of a robot that lost its disk does."""
+    pen = Pen()
+    first = pen.chunks(2)
+    pen.new_stream(b"b" * 16)
+    result = read([*first, *pen.chunks(1), *first[:again]])
+    assert result.verdict.counts == {"forked": again, "restarted": 1} and not result.verdict.sound
+    assert result.numbers == [0, 1, 0]
+
+
 def test_one_identity_on_two_robots():
     a, b = Pen(), Pen(stream=b"b" * 16)
     result = read([a.write(message(0)), b.write(message(1)), a.write(message(2)), b.write(message(3))])
