@@ -15,7 +15,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.process import BaseProcess
@@ -80,12 +80,9 @@ def notify(state: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
-    with Socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC) as sock:
-        try:
-            # A leading @ is the abstract namespace, written as a zero byte.
-            sock.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
-        except OSError:
-            log.debug("the service manager is gone")
+    with Socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC) as sock, suppress(OSError):  # it may be gone
+        # A leading @ is the abstract namespace, written as a zero byte.
+        sock.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
 def open_store(config: Settings, home: OperatorHome, *, read_only: bool = False) -> Inbox:

@@ -48,7 +48,7 @@ NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
 class Conversion:
     """One type's compiled conversion. `convert(message)` gives the record's data.
 
-    digested: how many fields a digest stood for, so far; last_digested: the latest of them.
+    digested: the latest field that a digest stood for.
     """
 
     def __init__(self, decoder: Decoder, selection: Selection = None, *, limit: int = DEFAULT_LIMIT) -> None:
@@ -56,8 +56,7 @@ class Conversion:
         self._ros1 = decoder.wire is Wire.ROS1
         self._limit = limit
         self.type_name = decoder.type_name
-        self.digested = 0
-        self.last_digested = ""
+        self.digested = ""
         self._names: dict[str, Any] = {"isfinite": isfinite, "_float": _float}  # of functions, in the expression
         expression = self._message(self.type_name, selection, "m", "")
         self.convert: Callable[[Any], dict[str, Any]] = eval(f"lambda m: {expression}", self._names)  # noqa: S307
@@ -181,8 +180,7 @@ class Conversion:
         return convert
 
     def _too_large(self, path: str, content: bytes) -> dict[str, Any]:
-        self.digested += 1
-        self.last_digested = path
+        self.digested = path
         return {"sm3": sm3.digest(content).hex(), "length": len(content)}
 
 

@@ -32,15 +32,11 @@ log = logging.getLogger(__name__)
 
 
 class Cause(StrEnum):
-    """Why a message was not captured as it came."""
+    """Why a message was not captured."""
 
-    FIELD_DIGESTED = "field_digested"  # captured, with a digest in place of a large field
     FIELD_MISSING = "field_missing"
     RECORD_TOO_LARGE = "record_too_large"
     UNDECODABLE = "undecodable"
-
-
-_LOSSES: Final = frozenset(Cause) - {Cause.FIELD_DIGESTED}
 
 
 class Record(NamedTuple):
@@ -67,12 +63,13 @@ class Capture:
     source_kind: stands in every line.
     live: types come from whoever publishes, so a message whose type lacks a field of its rule is refused; without it,
     that is an error of the configuration.
-    counts: messages so far that were left out, by topic and Cause; FIELD_DIGESTED counts fields.
+    lost: messages so far that were left out, by topic and Cause.
     """
 
     def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
-        self.counts: Counter[tuple[str, str]] = Counter()
+        self.lost: Counter[tuple[str, str]] = Counter()
+        self._digested: set[str] = set()  # topics of which a field was, which is said once
         self._topics: dict[str, _Topic | None] = {}
         self._source_kind = source_kind
         self._live = live
@@ -97,7 +94,6 @@ class Capture:
             return None
         try:
             conversion = topic.conversion(raw.decoder)
-            digested_before = conversion.digested
             if not 0 <= raw.received_ns <= LAST_TIME:
                 raise DecodeError(f"its receive time is {raw.received_ns}")
             data = conversion.convert(raw.decoder.decode(raw.raw))
@@ -114,9 +110,10 @@ class Capture:
         if len(line) > (most := MAX_ARCHIVED_LINE if topic.rule.archive else MAX_LINE):
             why = f"its fields come to more than {most} bytes of JSON; choose fewer fields"
             return self._left_out(raw, Cause.RECORD_TOO_LARGE, why)
-        if conversion.digested > digested_before:
-            text = f"{conversion.last_digested} is above {topic.rule.limit} bytes: its SM3 digest is captured instead"
-            self._count(raw.topic, Cause.FIELD_DIGESTED, text, conversion.digested - digested_before)
+        if conversion.digested and raw.topic not in self._digested:
+            self._digested.add(raw.topic)
+            text = "%s: %s is above %d bytes: its SM3 digest is captured instead"
+            log.warning(text, raw.topic, conversion.digested, topic.rule.limit)
         topic.schedule.captured(raw.received_ns)
         definition = raw.type_name, definition_line(raw.decoder)
         return Record(raw.topic, raw.received_ns, line, definition, topic.rule.trigger, topic.rule.archive)
@@ -127,14 +124,9 @@ class Capture:
         if state is not None:
             state.conversion(decoder)
 
-    @property
-    def lost(self) -> dict[tuple[str, str], int]:
-        """Messages that were refused here, by topic and why."""
-        return {key: count for key, count in self.counts.items() if key[1] in _LOSSES}
-
     def loss_lines(self, source_lost: Mapping[tuple[str, str], int]) -> list[bytes]:
         """The lines for what was refused here, and lost by the source (`Source.lost`), since the last call."""
-        so_far = Counter(source_lost) + Counter(self.lost)
+        so_far = Counter(source_lost) + self.lost
         new, self._declared = so_far - self._declared, so_far
         return [lost_line(count, *key) for key, count in new.items()]
 
@@ -149,10 +141,7 @@ class Capture:
 
     def _left_out(self, raw: RawMessage, cause: Cause, why: str) -> Record | None:
         """Count it; None is what became of it."""
-        self._count(raw.topic, cause, f"a message is left out: {why}")
+        self.lost[raw.topic, cause] += 1
+        if self.lost[raw.topic, cause] == 1:
+            log.warning("%s: a message is left out: %s", raw.topic, why)
         return None
-
-    def _count(self, topic: str, cause: Cause, text: str, count: int = 1) -> None:
-        self.counts[topic, cause] += count
-        if self.counts[topic, cause] == count:
-            log.warning("%s: %s", topic, text)

@@ -74,9 +74,6 @@ def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
     datagrams waiting. NetworkError if the port is taken or not allowed.
     """
     family, place = _resolve(*address, socket.AI_PASSIVE)
-    reuse = getattr(socket, "SO_REUSEPORT", None)
-    if workers > 1 and reuse is None:
-        raise NetworkError("this system cannot share a port between processes; run with one worker")
     sockets: list[socket.socket] = []
     try:
         # Bound without SO_REUSEPORT first: another server's port must be an error, not half of its datagrams.
@@ -85,8 +82,8 @@ def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
             place = (place[0], probe.getsockname()[1])
         for _ in range(workers):
             sockets.append(_open(family))
-            if workers > 1 and reuse is not None:
-                sockets[-1].setsockopt(socket.SOL_SOCKET, reuse, 1)
+            if workers > 1:
+                sockets[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
             sockets[-1].bind(place)
     except OSError as error:
         for sock in sockets:

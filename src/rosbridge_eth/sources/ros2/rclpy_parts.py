@@ -48,12 +48,8 @@ def import_rclpy() -> Any:
             SingleThreadedExecutor=import_module("rclpy.executors").SingleThreadedExecutor,
             SubscriptionEventCallbacks=events.SubscriptionEventCallbacks,
         )  # fmt: skip
-    except ModuleNotFoundError as error:
-        if error.name == "rclpy":
-            raise SourceError(f"a ROS 2 source needs rclpy, which this Python does not have; {GET_RCLPY}") from None
-        raise SourceError(f"rclpy is there but needs {error.name}, which is not; {GET_RCLPY}") from error
     except ImportError as error:
-        raise SourceError(f"rclpy cannot be loaded: {first_line(error)}; {GET_RCLPY}") from error
+        raise SourceError(f"a ROS 2 source needs rclpy ({first_line(error)}); {GET_RCLPY}") from error
 
 
 def take(subscription: Any, generated: Any) -> tuple[bytes, Mapping[str, Any]] | None:

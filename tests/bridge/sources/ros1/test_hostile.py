@@ -182,7 +182,7 @@ def test_messages_that_do_not_fit_their_definition_do_not_end_anything(master):
     with closing_all(hostile), Listening(master.uri, ["/t", "/good"], tolerant=True) as listening:
         listening.wait_for("/t", 1)
         assert listening.data["/t"] == [{"data": "ok"}]
-        assert listening.capture.counts["/t", "undecodable"] == len(bad)
+        assert listening.capture.lost["/t", "undecodable"] == len(bad)
         assert listening.source.counts["/t", "connected"] == 1
         still_heard(listening)
 

@@ -57,7 +57,7 @@ def test_a_robot_without_rclpy_says_what_to_do(robot: RobotHome, ros: Graph, tmp
     assert process.finish() == 8
     told = " ".join("\n".join(process.errors).split())
     assert (
-        "a ROS 2 source needs rclpy, which this Python does not have; start the robot in an environment where" in told
+        "a ROS 2 source needs rclpy (No module named 'rclpy'); start the robot in an environment where" in told
     )
     assert "Traceback" not in told
 
