@@ -31,6 +31,7 @@ from rosbridge_eth.capture.conversion import BYTES
 from rosbridge_eth.capture.definitions import DURATION, TIME
 from rosbridge_eth.capture.messages import MAX_RAW
 from rosbridge_eth.capture.process import LAST_TIME
+from rosbridge_eth.capture.restoration import NOT_FINITE
 from rosbridge_eth.capture.rules import Step, parse_path, parse_paths
 from rosbridge_eth.errors import ConfigError
 
@@ -46,7 +47,6 @@ _OPERATORS: Final[dict[str, Callable[[Any, Any], bool]]] = {
     "==": operator.eq, "!=": operator.ne, "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
 }  # fmt: skip
 _FORM = re.compile(r"(\S+) +([^\s=!<>]+) *(==|!=|<=|>=|<|>) *(.+)")
-_NOT_FINITE: Final = {"NaN", "Infinity", "-Infinity"}  # as Conversion writes them
 
 
 class Condition(NamedTuple):
@@ -94,7 +94,7 @@ class Condition(NamedTuple):
         def holds(raw: RawMessage) -> bool:
             found = _at(self.path, conversion.convert(decoder.decode(raw.raw)))
             if wanted == "a number":
-                found = (float(each) if each in _NOT_FINITE else each for each in found)
+                found = (NOT_FINITE.get(each, each) for each in found)
             return any(compare(each, self.value) for each in found)
 
         return holds

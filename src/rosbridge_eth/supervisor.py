@@ -260,15 +260,12 @@ class Supervisor:
                 process.kill()
                 process.join()
 
-    def _open_store(self) -> Inbox:
-        return open_store(self._config, self._home)
-
     # What runs in the children; each opens its own connections to store and chain.
 
     def _work(self, number: int, sock: Socket) -> None:
         reception = open_reception(
             number, self._config, self._secrets.identity, self._home, Registry(self._home.registry),
-            self._open_store(), self._deployment,
+            open_store(self._config, self._home), self._deployment,
         )
         worker, beats = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), Beats()
 
@@ -280,7 +277,7 @@ class Supervisor:
 
     def _submit(self) -> None:
         asked, ledger = _terminated(self._pid), Ledger.connect(self._config.chain.url, self._deployment)
-        registry, inbox = Registry(self._home.registry), self._open_store()
+        registry, inbox = Registry(self._home.registry), open_store(self._config, self._home)
         submitter = open_submitter(self._config, ledger, inbox, registry, self._secrets.keys)
         subjects = {"trouble": "the node", "unconfirmed": "confirmation", "funds": "the treasury"}
         troubles = {name: Trouble(log, subject) for name, subject in subjects.items()}

@@ -26,7 +26,7 @@ from typing import Any, Literal, TypeAlias
 
 import orjson
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
+from rosbags.interfaces.typing import Fielddefs, FieldDesc
 
 from rosbridge_eth.capture.idl import idl_as_msg
 from rosbridge_eth.errors import SourceError
@@ -105,10 +105,6 @@ class Definition:
     fields: Mapping[str, Fielddefs]
     smallest: Mapping[str, int]
     text: str
-
-    def typesdict(self) -> Typesdict:
-        """The tree for rosbags' type store: no constants."""
-        return {name: ([], list(fields)) for name, fields in self.fields.items()}
 
     @cached_property
     def md5(self) -> str:

@@ -66,7 +66,7 @@ class Decoder:
         """rosbags' type store with this type and what it refers to, and nothing else."""
         store = Typestore(max_sequence_length=MAX_RAW)
         with _compiling:
-            store.register(self.definition.typesdict())
+            store.register({name: ([], list(fields)) for name, fields in self.fields.items()})  # no constants
         return store
 
     def decode(self, raw: bytes | memoryview) -> object:

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from rosbridge_eth.config.models import AnySource
 from rosbridge_eth.sources.bag import BagSource, sample_bag
 from rosbridge_eth.sources.protocol import Clock, Emit, Offer, Selection, Source
-from rosbridge_eth.sources.ros1 import Ros1Source
-from rosbridge_eth.sources.ros2 import Ros2Source
+from rosbridge_eth.sources.ros1.source import Ros1Source
+from rosbridge_eth.sources.ros2.source import Ros2Source
 from rosbridge_eth.sources.sim import SimSource
 
 __all__ = ["BagSource", "Clock", "Emit", "Offer", "Selection", "SimSource", "Source", "open_source", "sample_bag"]

@@ -248,7 +248,7 @@ def test_a_constant_s_text_never_reaches_generated_code():
     decoder = decoder_for(Wire.ROS1, "a/Constants", text)
     assert decoder.decode(b"\x07\x00\x00\x00").x == 7
     assert not hasattr(sys, marker)
-    assert decoder.definition.typesdict() == {"a/msg/Constants": ([], [("x", (Nodetype.BASE, ("int32", 0)))])}
+    assert decoder.typestore.fielddefs["a/msg/Constants"] == ([], [("x", (Nodetype.BASE, ("int32", 0)))])
 
 
 def test_a_definition_is_kept_without_its_comments_and_with_its_constants():

@@ -9,7 +9,3 @@
 ROS 1 has no authentication: whoever reaches the network can publish. What is promised is that no publisher, master or
 caller of our API can make the bridge crash, wait, or use more memory than was set.
 """
-
-from rosbridge_eth.sources.ros1.source import Ros1Source
-
-__all__ = ["Ros1Source"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from enum import StrEnum
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 from rosbridge_eth.errors import SourceError
@@ -25,15 +24,6 @@ SLOWEST: Final = 100_000
 """A message is to arrive within STALLED seconds, and one more for so many bytes."""
 FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError)
 """What a peer can bring about: it says what is wrong, is gone or silent, or has a name that is none."""
-
-
-class Cause(StrEnum):
-    """Why a connection to a publisher ended, or was not made."""
-
-    UNREACHABLE = "unreachable"  # no answer, refused, name does not resolve, timed out
-    CLOSED = "closed"  # by the publisher, in good order as far as one can see
-    REFUSED = "refused"  # the publisher will not, or cannot be recorded: another type, no definition, a bad one
-    PROTOCOL = "protocol"  # what it sent is not TCPROS or XML-RPC
 
 
 class Publisher(threading.Thread):

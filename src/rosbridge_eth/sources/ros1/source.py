@@ -32,7 +32,7 @@ from rosbridge_eth.sources.live import LiveSource
 from rosbridge_eth.sources.protocol import Clock, Offer, Selection
 from rosbridge_eth.sources.ros1 import addressing, api
 from rosbridge_eth.sources.ros1.addressing import ProtocolError
-from rosbridge_eth.sources.ros1.publisher import FAILURES, LAST_RETRY, Cause, Publisher
+from rosbridge_eth.sources.ros1.publisher import FAILURES, LAST_RETRY, Publisher
 from rosbridge_eth.sources.ros1.tcpros import ANY, Publication
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class Ros1Source(LiveSource):
     master: URI; None is ROS_MASTER_URI. hostname: under which the master reaches us; None is ROS_HOSTNAME, ROS_IP or
     the address towards the master. node: our name; None is one of its own for each process.
     max_message: bytes. waiting: messages. timeout: seconds for a call, and for a publisher's header.
-    counts: messages received and too_large; publishers connected now; connections ended, by Cause.
+    counts: messages received and too_large; publishers connected now; connections ended.
     """
 
     kind = "ros1"
@@ -319,17 +319,11 @@ class Ros1Source(LiveSource):
             self.counts[publisher.topic, "connected"] -= connected
             if publisher.over.is_set():
                 return
-            if isinstance(error, ProtocolError):
-                cause = Cause.PROTOCOL
-            elif isinstance(error, SourceError):
-                cause = Cause.REFUSED
-            else:
-                cause = Cause.CLOSED if connected else Cause.UNREACHABLE
-            self.counts[publisher.topic, cause] += 1
+            self.counts[publisher.topic, "ended"] += 1
             if (topic := self._topics.get(publisher.topic)) is not None:
                 topic.rung = True  # it may have started anew somewhere else
         text = f"{publisher.topic}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
-        if cause is Cause.CLOSED:
+        if connected and not isinstance(error, SourceError):
             log.info("%s", text)
         else:
             key = f"publisher {publisher.topic} {publisher.uri}"

@@ -15,8 +15,7 @@ from pathlib import Path
 from ports import free_port
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
 from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros1 import Ros1Source
-from rosbridge_eth.sources.ros1.publisher import Cause
+from rosbridge_eth.sources.ros1.source import Ros1Source
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
 PUBLISHERS = Path(__file__).with_name("publishers.py")
@@ -157,7 +156,7 @@ class Listening:
 
     def ended(self, topic: str) -> int:
         """Attempts to connect, and connections, that came to nothing."""
-        return sum(self.source.counts[topic, cause] for cause in Cause)
+        return self.source.counts[topic, "ended"]
 
     def numbers(self, topic: str) -> list[int]:
         return [data["data"] for data in self.data.get(topic, ())]

@@ -9,8 +9,8 @@ import pytest
 
 from rosbridge_eth.errors import ExitCode, SourceError
 from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros2 import Ros2Source
 from rosbridge_eth.sources.ros2.rclpy_parts import Quality, most_that_all_offer
+from rosbridge_eth.sources.ros2.source import Ros2Source
 
 ALL = [Quality(reliable, latched) for reliable in (True, False) for latched in (True, False)]
 
