@@ -179,7 +179,7 @@ class Table:
     def write_parquet(self, path: Path) -> None:
         pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
         kinds = [{kind} for kind in _FIXED.values()] + list(self._columns.values())
-        types, values = zip(*(_arrow(pyarrow, found - {""}) for found in kinds), strict=True)
+        types, values = zip(*(_arrow(pyarrow, found) for found in kinds), strict=True)
         names = self._names([column.removesuffix("_ns") for column in _FIXED])
         schema, rows = pyarrow.schema(zip(names, types, strict=True)), self._read()
         with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
@@ -201,10 +201,10 @@ def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _kind(value: Any) -> str:
-    """Of a cell: bool, int, float, nan (text that may stand for a float), text, ints, floats, json; "" for any."""
+    """Of a cell: bool, int, float, nan (text that may stand for a float), text, ints, floats, json."""
     if isinstance(value, list):
         kinds = set(map(_kind, value))
-        return "ints" if kinds == {"int"} else "" if not kinds else "floats" if kinds <= _NUMBERS else "json"
+        return "ints" if kinds <= {"int"} else "floats" if kinds <= _NUMBERS else "json"
     if isinstance(value, str):
         return "nan" if value in NOT_FINITE else "text"
     if type(value) is int:
@@ -223,13 +223,13 @@ def _arrow(pyarrow: Any, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
         return pyarrow.bool_(), bool
     if kinds == {"uint"}:
         return pyarrow.uint64(), int
-    if kinds and kinds <= {"int", "time"}:
+    if kinds <= {"int", "time"}:
         return pyarrow.int64(), int
-    if kinds and kinds <= _NUMBERS:
+    if kinds <= _NUMBERS:
         return pyarrow.float64(), float
     if kinds == {"ints"}:
         return pyarrow.list_(pyarrow.int64()), list
-    if kinds and kinds <= {"ints", "floats"}:
+    if kinds <= {"ints", "floats"}:
         return pyarrow.list_(pyarrow.float64()), lambda cell: list(map(float, cell))
     return pyarrow.string(), str if kinds <= {"text", "nan"} else json.dumps
 

@@ -512,14 +512,14 @@ def test_a_parquet_file_has_numbers_times_and_lists(tmp_path, monkeypatch):
         "stream": "string", "number": "uint64", "chunk": "int64", "block": "int64", "transaction": "string",
         "header.stamp": "timestamp[ns, tz=UTC]", "header.frame_id": "string", "joints": "list<element: double>",
         "ids": "list<element: int64>", "on": "bool", "n": "int64", "f": "double", "big": "string", "mixed": "string",
-        "empty": "string", "x": "double",
+        "empty": "list<element: int64>", "x": "double",
     } == types  # fmt: skip
     rows = table.drop(["received", "captured", "header.stamp"]).to_pylist()
     assert table["received"].cast("int64").to_pylist() == [T0, T0 + 1, T0 + 2, T0 + 3, T0 + 9]
     assert table["header.stamp"].cast("int64").to_pylist() == [T0 + 7] * 4 + [None]
     assert (rows[1]["joints"], rows[1]["ids"], rows[1]["f"]) == ([1.0, 2.5], [1, 2], 0.5)
     assert rows[0]["f"] != rows[0]["f"], "NaN is a number that is not one"
-    assert (rows[1]["big"], rows[1]["mixed"], rows[1]["empty"]) == (str(2**64 - 1), '[{"a": 1}]', "[]")
+    assert (rows[1]["big"], rows[1]["mixed"], rows[1]["empty"]) == (str(2**64 - 1), '[{"a": 1}]', [])
     assert (rows[1]["header.frame_id"], rows[4]["n"], rows[4]["x"]) == ("=base", None, 0.5)
 
 
@@ -552,10 +552,12 @@ def test_whatever_only_a_lying_robot_signs_a_table_can_be_read(tmp_path):
 
 
 def test_columns_that_hold_this_and_that_are_text(tmp_path):
-    rows = [{"a": 1, "b": 1, "c": "NaN", "d": [1], "e": None}, {"a": "x", "b": 2.5, "c": "y", "d": 7, "e": {}}]
+    rows = [{"a": 1, "b": 1, "c": "NaN", "d": [1], "e": None, "f": [], "g": []},
+            {"a": "x", "b": 2.5, "c": "y", "d": 7, "e": {}, "f": 1.5, "g": ["x"]}]  # fmt: skip
     table = parquet(tmp_path / "t.parquet", [record(n, "pkg/msg/A", row) for n, row in enumerate(rows)])
-    assert {name: table[name].to_pylist() for name in "abcd"} == {
-        "a": ["1", '"x"'], "b": [1.0, 2.5], "c": ["NaN", "y"], "d": ["[1]", "7"]}  # fmt: skip
+    assert {name: table[name].to_pylist() for name in "abcdfg"} == {
+        "a": ["1", '"x"'], "b": [1.0, 2.5], "c": ["NaN", "y"], "d": ["[1]", "7"], "f": ["[]", "1.5"],
+        "g": ["[]", '["x"]']}  # fmt: skip
 
 
 def test_a_parquet_file_of_nothing_has_its_columns(tmp_path):
