@@ -30,6 +30,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST, ThreadingWSGIServe
 from prometheus_client.multiprocess import MultiProcessCollector
 
 from rosbridge_eth.channel import Drop
+from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
@@ -237,24 +238,18 @@ class Web:
     Meant for the machine itself or a private network: whoever reaches the port reads names, balances and counts.
     """
 
-    def __init__(self, address: tuple[str, int], expected: Collection[str]) -> None:
+    def __init__(self, address: Address, expected: Collection[str]) -> None:
         self._expected = expected
         server = type("_Server6", (_Server,), {"address_family": socket.AF_INET6}) if ":" in address[0] else _Server
         try:
             self._http: WSGIServer = make_server(address[0], address[1], self._answer, server, _Handler)
         except OSError as error:
-            raise NetworkError(
-                f"TCP port {address[1]} of {address[0]} cannot be opened: {error.strerror}; correct `monitor`"
-            ) from error
-        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.2,), name="web", daemon=True)
-
-    @property
-    def address(self) -> tuple[str, int]:
-        host, port = self._http.server_address[:2]
-        return str(host), int(port)
+            raise NetworkError(f"TCP {address} cannot be opened: {error.strerror}; correct `monitor`") from error
+        self.address = Address(address.host, self._http.server_port)
 
     def start(self) -> None:
-        self._thread.start()
+        # Made only here: the server forks in between, and a thread made before that cannot be started after it (3.13).
+        threading.Thread(target=self._http.serve_forever, args=(0.2,), name="web", daemon=True).start()
 
     def stop(self) -> None:
         self._http.shutdown()

@@ -31,6 +31,7 @@ from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.config import load_server_config, reread
+from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.home import Deployment, OperatorHome
 from rosbridge_eth.identity import Identity
@@ -146,9 +147,8 @@ class Supervisor:
         self._stop.set()
 
     def run(
-        self, on_ready: Callable[[tuple[str, int]], None] = lambda address: None,
-        on_look: Callable[[], None] = lambda: None,
-    ) -> None:
+        self, on_ready: Callable[[Address], None] = lambda address: None, on_look: Callable[[], None] = lambda: None
+    ) -> None:  # fmt: skip
         """Check, open the port, start the processes, watch them.
 
         Raises BridgeError before the port is open, and ProcessError where a process does not come up however often
@@ -167,7 +167,7 @@ class Supervisor:
             try:
                 for name, task in tasks.items():
                     self._start(name, task)
-                on_ready(sockets[0].getsockname()[:2])
+                on_ready(Address(*sockets[0].getsockname()[:2]))
                 notify("READY=1")
                 while not self._stop.wait(WATCH):
                     if self._again.is_set():
@@ -299,7 +299,7 @@ class Supervisor:
 
     def _watch(self, web: metrics.Web) -> None:
         web.start()
-        log.info("/metrics, /healthz and /readyz at http://%s:%d", *web.address)
+        log.info("/metrics, /healthz and /readyz at http://%s", web.address)
         stopped = _terminated(self._pid)
         while not stopped():
             time.sleep(WATCH)

@@ -76,6 +76,20 @@ def test_output_that_cannot_be_written_is_one_line(place: Place, unbuffered: str
     assert (process.returncode, process.stderr) == (ExitCode.FAILED, "rosbridge-eth: No space left on device\n")
 
 
+@pytest.mark.parametrize("closed, code, says", [
+    ("<&-", ExitCode.IDENTITY, "rosbridge-eth: the reader passphrase is needed and there is no terminal to ask at: "
+     "give --passphrase-file"),
+    (">&-", ExitCode.FAILED, "rosbridge-eth: not writable"), ("<&- >&- 2>&-", ExitCode.FAILED, None),
+])  # fmt: skip
+def test_streams_that_were_closed_before(place: Place, closed: str, code: ExitCode, says: str | None) -> None:
+    command = "read robot_1" if closed == "<&-" else "status --json"
+    process = subprocess.run(
+        ["bash", "-c", f'"{sys.executable}" -m rosbridge_eth {command} {closed}'], stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": SOURCE}, check=False,
+    )
+    assert (process.returncode, process.stderr) == (code, f"{says}\n" if says else "")
+
+
 def test_a_source_that_breaks_ends_the_robot_with_its_error(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     place.robot.config.write_text(f'{ODOM}[source]\nkind = "sim"\n')
     robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)

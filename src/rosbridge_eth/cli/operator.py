@@ -15,7 +15,7 @@ import typer
 from rosbridge_eth import status, terminal
 from rosbridge_eth.bundle import Request
 from rosbridge_eth.config import load_server_config
-from rosbridge_eth.config.values import counted
+from rosbridge_eth.config.values import Address, counted
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
@@ -438,8 +438,8 @@ def _serve(
     config = load_server_config(place.config)
     secrets = Secrets(load_server_identity(place, passphrase), keys)
 
-    def ready(address: tuple[str, int]) -> None:
-        talk(f"Listening on UDP {address[0]}:{address[1]} (workers: {workers or config.workers}); Ctrl-C ends it.")
+    def ready(address: Address) -> None:
+        talk(f"Listening on UDP {address} (workers: {workers or config.workers}); Ctrl-C ends it.")
 
     with live(lambda: status.fleet(place)) as show:
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
+import multiprocessing
 import os
 import socket
 import subprocess
@@ -19,6 +20,7 @@ from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
 from rosbridge_eth import metrics
+from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.metrics import Web
 
@@ -27,7 +29,7 @@ SLOW = 16
 
 @pytest.fixture
 def web() -> Iterator[Web]:
-    made = Web(("127.0.0.1", 0), ["robot"])
+    made = Web(Address("127.0.0.1", 0), ["robot"])
     metrics.beat("robot", time.time())
     metrics.CONDITION.labels("robot has a session").set(1)
     metrics.CAPTURED.labels("robot_1").set(3)
@@ -104,13 +106,21 @@ def test_a_port_that_is_taken_is_an_error_that_names_the_key(web: Web):
         Web(web.address, [])
 
 
+def test_it_is_started_in_a_process_that_was_forked_since():
+    made = Web(Address("127.0.0.1", 0), [])
+    child = multiprocessing.get_context("fork").Process(target=made.start)  # as the server starts its monitor
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0
+
+
 def test_it_listens_on_ipv6_too():
     try:
-        made = Web(("::1", 0), [])
+        made = Web(Address("::1", 0), [])
     except NetworkError:
         pytest.skip("this machine has no IPv6")
     made.start()
-    assert made.address[0] == "::1"
+    assert str(made.address) == f"[::1]:{made.address.port}" != "[::1]:0", "as a browser takes it"
     made.stop()
 
 
