@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import stat
 import subprocess
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -204,6 +207,23 @@ def test_revoke_keeps_the_record_in_the_list(fleet: Path, capsys: pytest.Capture
     foreign = x509.self_signed(sm2.PrivateKey.generate(), subject="CN=x", not_before=now, not_after=now)
     Path("foreign.crt").write_bytes(foreign.to_pem())
     assert "does not hold" in refusal(capsys, *revoke, "foreign.crt")
+
+
+def test_revocations_wait_for_each_other(fleet: Path) -> None:
+    revoked, crl = issue(), Path("fleet/ca.crl.pem")
+    run("revoke", "--dir", "fleet", *PASSWORD)
+    before = crl.read_bytes()
+    crl.unlink()
+    os.mkfifo(crl)  # shows when it is read, and makes that last
+    first = Thread(target=run, args=("revoke", "--dir", "fleet", *PASSWORD, "robot.crt"))
+    first.start()
+    with crl.open("wb") as read_by_first, Path("fleet/ca.crt.pem").open("rb") as second:
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(second, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        read_by_first.write(before)
+    after = x509.CertificateRevocationList.from_pem(crl.read_bytes())
+    first.join()
+    assert revoked is not None and after.find(revoked.serial_number)
 
 
 def test_show_prints_what_there_is(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,9 @@ record of what was revoked. Everything else is in the certificates.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import TypeVar
@@ -209,8 +210,24 @@ def _require_useful(certificate: x509.Certificate, ca: x509.Certificate, at: dat
         raise CertificateError(f"the CA's certificate ends first, at {ca.not_after}; give fewer --days")
 
 
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One process at a time: of two lists made at once, the later would lack what the earlier revokes."""
+    with (folder / "ca.crt.pem").open("rb") as held:
+        with contextlib.suppress(ImportError, OSError):  # not on Windows, nor on every network's file system
+            import fcntl
+
+            fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+
+
 def run_revoke(options: argparse.Namespace) -> int:
     certificate, key = _authority(options)
+    with _alone(options.dir):
+        return _revoke(options, certificate, key)
+
+
+def _revoke(options: argparse.Namespace, certificate: x509.Certificate, key: sm2.PrivateKey) -> int:
     uid = uid_bytes(options.uid)
     path = options.dir / "ca.crl.pem"
     entries: list[x509.RevokedCertificate] = []
