@@ -72,6 +72,8 @@ def _speed(value: Any) -> float | None:
 
 
 def _table_of_name(value: Any) -> Any:
+    if not isinstance(value, str | dict):
+        raise ValueError(f"is {value!r}; write a name in quotes, or a table")
     return {"topic": value} if isinstance(value, str) else value
 
 
