@@ -6,20 +6,22 @@ processes are threads. What comes back is compared with the bag's messages, fiel
 
 from __future__ import annotations
 
+import io
 import secrets
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
+from rich.console import Console
+from rich.text import Text
 
 from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
@@ -44,6 +46,14 @@ if TYPE_CHECKING:
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
 SETTLE = 60.0  # seconds for the last chunk to be confirmed
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>From a topic to the chain and back</title>
+<meta name="viewport" content="width=device-width">
+<style>body {{ margin: 2rem }} pre {{ overflow-x: auto }} img {{ max-width: 100% }} {stylesheet}</style>
+<h1>From a topic to the chain and back</h1>
+<p>The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
+<pre>{code}</pre>
+<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain that hold a position"></html>
+"""
 
 
 @dataclass(slots=True)
@@ -264,7 +274,7 @@ def demo(
     trajectory = outputs.Trajectory()
     for record in result.records:
         trajectory.write(record)
-    drawn = trajectory.draw(report / "trajectory.png") > 0
+    trajectory.draw(report / "trajectory.png")
     stages = result.stages
     counts = list(zip(
         ("records captured", "chunks of the robot's log", "lines stored by the server", "records equal to the bag's"),
@@ -278,9 +288,15 @@ def demo(
         for each in result.transactions
     ]
     said = [*result.verdict.lines(), *result.comparison.differences]
-    page = _html(chosen, result, drawn, [("Records", ("stage", ""), counts), ("Time", ("step", "time"), times),
-                                         ("Transactions", heads, batches)], said)  # fmt: skip
-    (report / "report.html").write_text(page, encoding="utf-8")
+    tables = [
+        table("Records", ["stage", "records"], counts, right=[1]),
+        table("Time", ["step", "time"], times, right=[1]),
+        table(f"Transactions to {result.contract}", heads, batches, right=[0, 1, 2, 3, 4]),
+    ]
+    passed = "Every record came back, proven and equal to the bag's." if result.passed else "Not all came back."
+    page = Console(record=True, file=io.StringIO(), width=140, highlight=False, emoji=False)
+    page.print(*map(Text, (f"{passed} The bag is {chosen.name}.", *said)), *tables, sep="\n")
+    page.save_html(str(report / "report.html"), code_format=PAGE)
     if json:
         print_json({
             "passed": result.passed, "seconds": result.seconds, "times": stages.times,
@@ -290,48 +306,10 @@ def demo(
             "transactions": [dict(zip(heads, row, strict=True)) for row in batches],
         })  # fmt: skip
     else:
-        data.print(table("Records", ["stage", "records"], counts, right=[1]))
-        data.print(table("Time", ["step", "time"], times, right=[1]))
-        data.print(table(f"Transactions to {result.contract}", heads, batches, right=[0, 1, 2, 3, 4]))
+        data.print(*tables)
     for line in said:
         talk(line)
     if not result.passed:
         raise VerificationError("not every record came back as it is in the bag; the lines above say which")
     talk(f"{stages.verified} of {stages.captured} records came back from the chain, proven and equal to the bag's, "
          f"in {result.seconds:.1f} s. The report is {report / 'report.html'}.")
-
-
-def _html(
-    bag: Path, result: DemoResult, drawn: bool,
-    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[object]]]], said: Sequence[str],
-) -> str:  # fmt: skip
-    """A page that needs nothing but its folder."""
-
-    def rows(lines: Iterable[Sequence[object]], cell: str) -> str:
-        cells = ("".join(f"<{cell}>{escape(str(value))}</{cell}>" for value in line) for line in lines)
-        return "".join(f"<tr>{line}</tr>" for line in cells)
-
-    passed = "Every record came back, proven and equal to the bag's."
-    verdict = passed if result.passed else "Not every record came back."
-    shown = "".join(
-        f"<h2>{title}</h2><div class=wide><table>{rows([heads], 'th')}{rows(lines, 'td')}</table></div>"
-        for title, heads, lines in tables
-    )
-    picture = '<img src="trajectory.png" alt="Trajectory drawn from the records on the chain">'
-    return f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>From a topic to the chain and back</title>
-<meta name="viewport" content="width=device-width">
-<style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
-table {{ border-collapse: collapse; margin: .5rem 0 1.5rem }} td, th {{ border: 1px solid #ccc; padding: .2rem .7rem }}
-td {{ font-variant-numeric: tabular-nums; overflow-wrap: anywhere }} .wide {{ overflow-x: auto }}
-.verdict {{ font-weight: 600; color: {"#1a6b3c" if result.passed else "#a32020"} }}
-img {{ max-width: 100% }} code {{ overflow-wrap: anywhere }}
-</style>
-<h1>From a topic to the chain and back</h1>
-<p class="verdict">{verdict}</p>
-<p>Bag <code>{escape(bag.name)}</code>, contract <code>{escape(result.contract)}</code>.
-The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
-<h2>The trajectory, from the chain</h2>{picture if drawn else "<p>No record holds a position.</p>"}
-{shown}<h2>The verdict</h2><ul>{"".join(f"<li>{escape(line.strip())}</li>" for line in said)}</ul>
-</html>
-"""

@@ -28,7 +28,7 @@ from rosbridge_eth import sources
 from rosbridge_eth.archive import open_archive
 from rosbridge_eth.bundle import needs_password, read_bundle
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
-from rosbridge_eth.channel.udp import RECEIVE_BUFFER, UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
 from rosbridge_eth.config.values import parse_address
@@ -40,7 +40,7 @@ from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.sender import mend
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.status import ANSWER_TIME, DEAD, span
+from rosbridge_eth.status import ANSWER_TIME, span
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 from rosbridge_eth.topics import offered
 
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 
 HANDSHAKE_TIME, ATTEMPT_TIME = 6.0, 2.5  # seconds for a server to answer; for an attempt, with which a refusal is known
 EXPIRY = timedelta(days=30)
-LITTLE_ROOM, SOME_ROOM = 64 << 20, 1 << 30  # bytes
+LITTLE_ROOM = 64 << 20  # bytes
 WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
-OLD_HEAD, DEAD_HEAD = 3600.0, 12 * 3600.0  # seconds since the last block
+OLD_HEAD = 12 * 3600.0  # seconds since the last block
 ANYWHERE = ("0.0.0.0", "::")  # noqa: S104 - what is looked for
 
 
@@ -100,10 +100,7 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
 
 
 def clock(home: Home, secret: bytes | None) -> Findings:
-    now = datetime.now(UTC)
-    if now.year < 2026:
-        yield broken("clock", f"it says {now:%Y-%m-%d}", "set the clock; certificates are refused before their time")
-    elif not clock_synchronised():
+    if not clock_synchronised():
         yield note("clock", "the kernel does not hold it to be synchronised",
                    "start systemd-timesyncd or chrony; records say that their time is not to be relied on")
     else:
@@ -132,10 +129,8 @@ def disk(home: Home, secret: bytes | None) -> Findings:
     if free < LITTLE_ROOM or (found.f_files and not found.f_favail):
         yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home.path}",
                      "make room: until there is some nothing more is taken; what was taken is safe")
-    elif free < SOME_ROOM:
-        yield note("disk", f"{free >> 20} MiB free at {home.path}", "make room; chunks wait here if the chain is away")
     else:
-        yield ok("disk", f"{free >> 30} GiB free")
+        yield ok("disk", f"{free >> 20} MiB free")
 
 
 def certificates(folder: Path, renewal: str) -> Findings:
@@ -217,9 +212,9 @@ def chain(ledger: Ledger) -> Findings:
     if age < -WRONG_CLOCK:
         yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
     elif age > OLD_HEAD:
-        mended = ("set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
-                  " makes the next one with the next transaction)")  # fmt: skip
-        yield (broken if age > DEAD_HEAD else note)("clock", f"by it, the last block is {span(age)} old", mended)
+        yield broken("clock", f"by it, the last block is {span(age)} old",
+                     "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
+                     " makes the next one with the next transaction)")
 
 
 # An operator's home
@@ -233,15 +228,13 @@ def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings
         content = bundle.read_bytes()
         try:
             told = robots if needs_password(content) else read_bundle(content).end.server_address
-            nowhere = parse_address(told).host in ANYWHERE
-        except (IdentityError, ValueError):
+        except IdentityError:
             yield note("bundle", f"{bundle} was damaged",
                        f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
             continue
         if told != robots:
-            found = f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}"
-            mended = f'write server = "{robots}" into the robot.toml of who joined with it'
-            yield (broken if nowhere else note)("bundle", found, mended)
+            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
+                       f'write server = "{robots}" into the robot.toml of who joined with it')
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -278,12 +271,6 @@ def door(home: OperatorHome, secret: bytes | None) -> Findings:
             yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
                          f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
     yield from monitor(config.monitor, runs)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        granted = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # the kernel doubles it: socket(7)
-    if granted < RECEIVE_BUFFER:
-        yield note("receive buffer", f"the kernel grants {granted >> 10} KiB of {RECEIVE_BUFFER >> 10} KiB",
-                   f"sysctl -w net.core.rmem_max={RECEIVE_BUFFER}, and in /etc/sysctl.d")
 
 
 def registry(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -302,15 +289,9 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
     except NothingThere:
         yield ok("store", "there is none yet; the server makes it")
         return
-    with closing(inbox), Registry(home.registry) as opened:
+    with closing(inbox):
         inbox.check()
-        names, held = opened.names(), inbox.totals()
-        yield ok("store", f"{sum(waiting.chunks for waiting in held.values())} chunks wait")
-        for tk, waiting in held.items():
-            if waiting.chunks and (hold := inbox.state(tk).hold):
-                yield note("on hold", f"{names.get(tk, tk.hex())}: {hold}", "docs/operations.md, On hold")
-        if dead := inbox.dead(DEAD):
-            yield note("dead letters", f"{len(dead)}, the last: {dead[0].why}", "docs/operations.md, Dead letters")
+        yield ok("store", f"{sum(waiting.chunks for waiting in inbox.totals().values())} chunks wait")
 
 
 def archive(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -356,9 +337,6 @@ def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
             if standing.certificates_hash != robot.hash or standing.revoked:
                 yield broken("registration", f"the contract has {robot.name} with other certificates, or revoked",
                              f"run `register {robot.name} REQUEST --replace`, or restore a newer registry.sqlite")
-            elif standing.balance < config.funds.below * WEI_PER_ETH:
-                yield note("accounts", f"{robot.name} has {standing.balance / WEI_PER_ETH:.4f} ETH",
-                           "the server tops it up when it writes, as long as the treasury can")
 
 
 # A robot's home

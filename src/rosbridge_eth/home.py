@@ -39,7 +39,6 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -171,27 +170,22 @@ def require_empty(path: Path) -> None:
 def new_home(path: Path) -> Iterator[None]:
     """An empty folder for a home, which is whole when the block ends; cut short, by a kill too, nothing of it counts.
 
-    ConfigError where anything else is there, or another process makes a home of it.
+    ConfigError where anything else is there.
     """
     require_empty(path)
     ours, mark = not path.exists(), path / _UNFINISHED
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with mark.open("ab") as held:
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(f"another process makes a home of {path}; wait, or choose another folder") from None
-        require_empty(path)  # which that process may have ended in between
+    mark.touch()
+    _clear(path)
+    try:
+        yield
+    except BaseException:
         _clear(path)
-        try:
-            yield
-        except BaseException:
-            _clear(path)
-            mark.unlink(missing_ok=True)
-            if ours:
-                path.rmdir()
-            raise
         mark.unlink(missing_ok=True)
+        if ours:
+            path.rmdir()
+        raise
+    mark.unlink(missing_ok=True)
 
 
 def _clear(path: Path) -> None:

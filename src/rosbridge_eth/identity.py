@@ -49,7 +49,6 @@ class Role(StrEnum):
     ROBOT = "robot"
     SERVER = "server"
     READER = "reader"
-    OPERATOR = "operator"
 
 
 class UntrustedCertificate(IdentityError):

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import traceback
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import TextIO
 
 from rosbridge_eth.errors import BridgeError
 
@@ -84,19 +82,15 @@ class JsonFormatter(logging.Formatter):
         })  # fmt: skip
 
 
-def log_to(stream: TextIO, format: LogFormat, verbosity: int) -> None:
-    """Send the bridge's logs to `stream`: warnings, with verbosity 1 what happens, with 2 every chunk.
+def log_to_stderr(format: LogFormat = LogFormat.TEXT, verbosity: int = 0) -> None:
+    """Send the bridge's logs to stderr: warnings, with verbosity 1 what happens, with 2 every chunk.
 
     Other packages' logs are shown from warnings on, whatever the verbosity: theirs would name URLs and quote requests.
     """
-    handler = logging.StreamHandler(stream)
+    handler = logging.StreamHandler()
     handler.setFormatter(JsonFormatter() if format is LogFormat.JSON else TextFormatter())
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger(LOGGER).setLevel(LEVELS[min(verbosity, len(LEVELS) - 1)])
-
-
-def log_to_stderr(format: LogFormat = LogFormat.TEXT, verbosity: int = 0) -> None:
-    log_to(sys.stderr, format, verbosity)
 
 
 def speaks_json() -> bool:

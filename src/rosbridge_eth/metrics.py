@@ -2,7 +2,7 @@
 
 A running server or robot has its figures in files of a folder in memory (`shared`, prometheus_client's multiprocess
 mode), to which its home leads: that is how the server's processes share them, and how `status` knows. The table of
-docs/operations.md is `reference`. The server is healthy while its processes beat, and ready when every condition holds,
+docs/operations.md has them all. The server is healthy while its processes beat, and ready when every condition holds,
 too.
 """
 
@@ -358,17 +358,3 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     CONDITION.labels("robot has a session").set(robot.sender.statistics.connected)
     CONDITION.labels("server's name has an address").set(robot.loop.resolved)
     CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)
-
-
-def reference() -> str:
-    """The table of docs/operations.md, which a test compares."""
-    lines = ["| metric | kind | labels | |", "| --- | --- | --- | --- |"]
-    for family in REGISTRY.collect():
-        metric = family.name + ("_total" if family.type == "counter" else "")
-        lines.append(f"| `{metric}` | {family.type} | {_labels(family.name)} | {family.documentation} |")
-    return "\n".join(lines) + "\n"
-
-
-def _labels(name: str) -> str:
-    metric = REGISTRY._names_to_collectors[name]
-    return ", ".join(f"`{label}`" for label in metric._labelnames)  # type: ignore[attr-defined]

@@ -4,8 +4,7 @@ A live source is listened to for some seconds; a bag or a simulation is read as 
 The messages are captured, written and sealed as a robot does it, with keys that are thrown away: sizes are measured,
 only the way from there to a day is arithmetic. A topic's cost is that of its records alone, compressed; the headers of
 chunks and the transactions come once, with the total. What was heard once costs nothing a day, and so does what is
-written only when a trigger's event happens. Of a topic whose messages are too large for the chain a few are captured
-whole as well, to tell what that costs there and in the archive.
+written only when a trigger's event happens.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from typing import Annotated, Any, TypeAlias
 import typer
 
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
-from rosbridge_eth.capture.rules import ARCHIVE_LIMIT
 from rosbridge_eth.chunk import Chunk, Log
 from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
 from rosbridge_eth.config.models import SOURCE_KINDS, BagConfig, SimConfig
@@ -38,7 +36,6 @@ SIMULATED = 60 * 10**9  # ns of a simulation without an end that are looked at
 SETTLED = 1.0  # seconds in which a live graph offers nothing new
 PATIENCE = 5.0  # seconds for it to offer anything
 ENOUGH = 2**24  # bytes of captured lines, after which no more is read
-FEW = 8  # large messages of a topic that are captured whole
 
 
 def robot_toml(topics: Sequence[str], source: str) -> str:
@@ -84,16 +81,12 @@ Line: TypeAlias = tuple[float, bytes, bool]
 
 @dataclass(slots=True)
 class Heard:
-    """A topic: when its messages came (ns since 1970), their bytes, and the lines they were captured as.
-
-    whole: those of a few messages that are too large for the chain, as they would be in the archive.
-    """
+    """A topic: when its messages came (ns since 1970), their bytes, and the lines they were captured as."""
 
     offer: Offer
     times: list[int] = field(default_factory=list)
     size: int = 0
     lines: list[Line] = field(default_factory=list)
-    whole: list[Line] = field(default_factory=list)
     trigger: str | None = None
 
     @property
@@ -115,7 +108,6 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     source, stop, room = everything(config), threading.Event(), [ENOUGH]
     timer = threading.Timer(seconds, stop.set)
     capture = Capture([*config.rules(), TopicRule("**")], source_kind=source.kind, live=True)
-    whole = Capture([TopicRule("**", limit=ARCHIVE_LIMIT, archive=True)], source_kind=source.kind, live=True)
 
     def take(raw: RawMessage) -> None:
         topic = heard.setdefault(raw.topic, Heard(Offer(raw.topic, raw.type_name)))
@@ -125,9 +117,6 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
             topic.trigger = record.trigger
             topic.lines.append((raw.received_ns / 1e9, record.line, record.archive))
             room[0] -= len(record.line)
-        large = len(raw.raw) > config.capture.field_limit and len(topic.whole) < FEW
-        if large and (record := whole.process(raw, raw.received_ns)):
-            topic.whole.append((raw.received_ns / 1e9, record.line, True))
         if room[0] < 0:
             stop.set()
 
@@ -150,24 +139,13 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
                for archived in (False, True)]
         for name, topic in heard.items() for sealed in [_sealed(topic.all_day, config, source.kind, readers)]
     }  # fmt: skip
-
-    def kept_whole(topic: Heard) -> dict[str, float] | None:
-        """A day of it: bytes of its bodies, and gas where these are on the chain, or in the archive."""
-        if topic.rate is None or not topic.whole:
-            return None
-        sealed, daily = _sealed(topic.whole, config, source.kind, readers), DAY * topic.rate / len(topic.whole)
-        inside = daily * sum(len(chunk.body) for chunk in sealed)
-        headers = GAS_A_BYTE * daily * sum(len(chunk.on_chain.encoded) for chunk in sealed)
-        return {"bytes_per_day": inside, "gas_per_day": GAS_A_BYTE * inside + headers, "gas_archived": headers}
-
     return {
         "seconds": took,
         "topics": [
             {"topic": name, "type": topic.offer.type_name, "nodes": list(topic.offer.nodes),
              "chosen": topic in chosen, "trigger": topic.trigger,
              "messages": (count := len(topic.times)), "rate": topic.rate, "size": topic.size / count if count else None,
-             "bytes_per_day": sum(bodies[name]), "gas_per_day": GAS_A_BYTE * bodies[name][0],
-             "whole": kept_whole(topic)}
+             "bytes_per_day": sum(bodies[name]), "gas_per_day": GAS_A_BYTE * bodies[name][0]}
             for name, topic in sorted(heard.items())
         ],
         "chunks_per_day": len(sizes) / days, "bytes_per_day": sum(sizes) / days,
@@ -234,10 +212,3 @@ def topics(
         f"What is taken makes {report['bytes_per_day'] / 1e6:.3g} MB a day in {report['chunks_per_day']:.0f} chunks"
         f" and costs {low:.3g} (full batches) to {high:.3g} (a transaction for each chunk) Ggas: as many ETH at 1 gwei."
     )
-    for each in report["topics"]:
-        if (whole := each["whole"]) is not None:
-            talk(
-                f"{each['topic']} is {whole['bytes_per_day'] / 1e9:.3g} GB a day if it is kept whole:"
-                f" {whole['gas_per_day'] / 1e9:.3g} Ggas on the chain, {whole['gas_archived'] / 1e9:.3g} with"
-                ' store = "archive" (docs/howto-archive.md).'
-            )

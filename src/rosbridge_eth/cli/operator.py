@@ -38,6 +38,8 @@ _ArchiveOption = Annotated[
 _CompromisedOption = Annotated[
     bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
 
+FUNDS = 1000  # ETH that the operator has on a local chain
+
 
 def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth up; rosbridge-eth up --chain http://127.0.0.1:8545")(up)
@@ -146,17 +148,8 @@ def up(
     with ExitStack() as stack:
         if port is not None and is_free(port):
             anvil = stack.enter_context(Anvil.start(port, state=state))
-            anvil.fund(place.account, 1000)
+            anvil.fund(place.account, FUNDS)
             talk(f"A local chain answers at {anvil.url}, kept in {state}.")
-        elif port is not None and deployed:
-            try:
-                with ledger_of(place):  # as when `chain` runs it
-                    pass
-            except ChainError as error:
-                raise ChainError(
-                    f"port {port} of 127.0.0.1, where the chain kept in {state} is to answer, is in use by something"
-                    " else: end that (the `up` or `chain` of another home?), then run `up` again"
-                ) from error
         if not deployed:
             made = deploy_contract(place, url, keys)
             if anvil is not None:
@@ -176,7 +169,6 @@ def init(
     listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
     chain: Annotated[str, typer.Option(help="JSON-RPC URL of a node.")] = "http://127.0.0.1:8545",
-    server_name: Annotated[str, typer.Option(help="The name in the server's certificate.")] = "server",
     ca: Annotated[Path | None, typer.Option(help="Keep the CA in this folder, or use the one that is there.")] = None,
     mnemonic_file: Annotated[Path | None, typer.Option(help="Restore the accounts from these words.")] = None,
     archive: _ArchiveOption = None,
@@ -196,7 +188,7 @@ def init(
     words = mnemonic_file and read_passphrase("mnemonic", "Mnemonic", file=mnemonic_file).decode()
     keys = init_home(
         place, passphrase, reader=ReaderHome(reader), reader_passphrase=readers, now=utc_now(), listen=listen,
-        public=public, chain_url=chain, server=server_name, ca=ca, archive=archive,
+        public=public, chain_url=chain, ca=ca, archive=archive,
         ca_passphrase=read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file)
         if ca_passphrase_file else None,
         keys=Keyring.from_mnemonic(words) if words else None,
@@ -213,7 +205,6 @@ def chain(
     port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port on 127.0.0.1.")] = 8545,
     block_time: Annotated[float | None, typer.Option(
         min=0.1, help="Seconds between blocks; without it each transaction gets its own.")] = None,
-    eth: Annotated[int, typer.Option(min=1, help="ETH on the operator's account.")] = 1000,
 ) -> None:
     """Start a local chain, kept in the home; the operator has ETH. It is an anvil, which npx fetches."""
     from rosbridge_eth.ledger.nodes import Anvil
@@ -224,8 +215,8 @@ def chain(
         signal.signal(number, signal.default_int_handler)
     try:
         with Anvil.start(port, state=home / "chain.json", block_time=block_time) as anvil:
-            anvil.fund(account, eth)
-            talk(f"A local chain answers at {anvil.url}; {account} has {eth} ETH. Ctrl-C ends it and keeps the chain.")
+            anvil.fund(account, FUNDS)
+            talk(f"A local chain answers at {anvil.url}; {account} has {FUNDS} ETH. Ctrl-C ends and keeps it.")
             anvil.wait()
             raise ChainError("the local chain ended by itself; start it again")
     except KeyboardInterrupt:

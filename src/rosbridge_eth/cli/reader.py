@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 
 import typer
 
-from rosbridge_eth.config import ReaderConfig, load_reader_config
-from rosbridge_eth.config.models import ArchiveConfig
+from rosbridge_eth.config import load_reader_config
 from rosbridge_eth.config.values import Address, counted, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
@@ -31,7 +30,6 @@ from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHome
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.reading.verify import Bodies
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -55,8 +53,6 @@ To: TypeAlias = Annotated[str | None, typer.Option(help="Only what was received 
 At: TypeAlias = Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")]
 Nodes: TypeAlias = Annotated[list[str] | None, typer.Option(
     "--node", help="Ask these nodes, not those of reader.toml.")]
-ArchiveUrl: TypeAlias = Annotated[str | None, typer.Option(
-    "--archive", help="Fetch archived bodies there, not where reader.toml says: folder, s3://…, or `no`.")]
 Confirmations: TypeAlias = Annotated[int, typer.Option(
     min=1, max=100_000, help="Read up to the block that has so many, itself counted.")]
 Confirm: TypeAlias = Annotated[bool, typer.Option(
@@ -97,7 +93,7 @@ def read(
     follow: Annotated[bool, typer.Option("--follow", help="Go on as blocks come, until Ctrl-C.")] = False,
     serve: Annotated[str | None, typer.Option(
         metavar="[HOST:]PORT", help="With --follow: show it on a page, on this machine.")] = None,
-    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
     """Give what a robot wrote, proven, from the chain. As JSON lines, bag, table or plot.
@@ -132,12 +128,12 @@ def read(
         records: Iterator[tuple[str, ProvenRecord]]
         if follow:
             records, said = stack.enter_context(
-                _following(place, robot, node, archive, confirmations, confirm, passphrase_file, choice, address, turns)
+                _following(place, robot, node, confirmations, confirm, passphrase_file, choice, address, turns)
             )
         else:
             [name] = robot
             reading, of_it = stack.enter_context(
-                _reading_of(place, name, node, archive, confirmations, confirm, passphrase_file)
+                _reading_of(place, name, node, confirmations, confirm, passphrase_file)
             )
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
@@ -180,7 +176,7 @@ def compare(
     topic: Annotated[list[str] | None, typer.Option(help="Only these topics; each must be on the chain.")] = None,
     some: Annotated[bool, typer.Option(
         "--some", help="The robot captures only some messages: those it does not are no difference.")] = False,
-    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
     """Hold a recording of your own against what the chain has. Message by message, field by field.
@@ -191,7 +187,7 @@ def compare(
 
     place = ReaderHome(home).require()
     choice = comparing.time_of(bag)
-    with _reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
+    with _reading_of(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
         made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
         said |= asdict(made)
     if json:
@@ -212,7 +208,7 @@ def evidence(
     robot: RobotName,
     file: Annotated[Path, typer.Argument(help="The file to write; as a page that checks itself if it ends in .html.")],
     home: ReaderHomeOption = READER_HOME, topic: Topic = None, from_: From = None, to: To = None, at: At = None,
-    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
     """Write a file that proves chosen records without key or node. It opens nothing else.
@@ -227,7 +223,7 @@ def evidence(
     if file.exists() or not file.parent.is_dir():
         raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
     place = ReaderHome(home).require()
-    with _reading_of(place, robot, node, archive, confirmations, confirm, passphrase_file) as (reading, said):
+    with _reading_of(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
         records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
         for _ in reading.chunks:
             continue  # the verdict is on all of the log
@@ -283,7 +279,7 @@ def grant(
     reader: Annotated[str, typer.Option(help="For whom: that reader's public.pem, or NAME for readers/NAME.pem.")],
     out: Annotated[Path | None, typer.Option(help="The file to write; ROBOT-NAME.grant without it.")] = None,
     home: ReaderHomeOption = READER_HOME,
-    node: Nodes = None, archive: ArchiveUrl = None, confirmations: Confirmations = 1, confirm: Confirm = False,
+    node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
     """Open a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
@@ -296,7 +292,7 @@ def grant(
     known = place.path / "readers" / f"{reader}.pem"
     peer = public_identity(read_given(known if known.exists() else Path(reader)))
     now = datetime.now(UTC)
-    with _asking(place, node, archive, confirmations, passphrase_file) as asked:
+    with _asking(place, node, confirmations, passphrase_file) as asked:
         certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
         peer = asked.trust.check(*certificates, role=Role.READER, at=now)
         out = out or Path(f"{robot}-{peer.name}.grant")
@@ -319,20 +315,6 @@ def grant(
 # What the commands share
 
 
-def _bodies(config: ReaderConfig, given: str | None) -> Bodies | None:
-    """What gives the bodies of archived chunks: the archive that was given or that of reader.toml, or nothing."""
-    from rosbridge_eth.archive import open_archive
-
-    archive = config.archive
-    if given is not None and given != "no":
-        try:
-            named = ArchiveConfig.model_validate({"url": given})
-        except ValueError as error:
-            raise typer.BadParameter(f"{given!r} is no archive", param_hint="--archive") from error
-        archive = named if archive is None else archive.model_copy(update={"url": named.url})
-    return None if archive is None or given == "no" else open_archive(archive).get
-
-
 class _Asked(NamedTuple):
     """Who reads, with what. read: `read_robot` that wants to know only whose log, when, and behind what."""
 
@@ -345,8 +327,9 @@ class _Asked(NamedTuple):
 
 @contextmanager
 def _asking(
-    place: ReaderHome, nodes: Sequence[str] | None, archive: str | None, confirmations: int, file: Path | None
+    place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
 ) -> Iterator[_Asked]:
+    from rosbridge_eth.archive import open_archive
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading.grant import open_folder
 
@@ -355,7 +338,7 @@ def _asking(
     trust = Trust(roots)
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
     bookmarks = Bookmarks(place.path / "bookmarks.json")
-    bodies = _bodies(config, archive)
+    bodies = None if config.archive is None else open_archive(config.archive).get
     granted = open_folder(place.grants, ledger=config.ledger, reader=identity, trust=trust)
 
     def read(robot: str, **more: Any) -> Reading:
@@ -372,10 +355,10 @@ def _asking(
 
 @contextmanager
 def _reading_of(
-    place: ReaderHome, robot: str, nodes: Sequence[str] | None, archive: str | None, confirmations: int,
+    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int,
     confirm: bool, file: Path | None,
 ) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    with _asking(place, nodes, archive, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
+    with _asking(place, nodes, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
         yield found
 
 
@@ -399,7 +382,7 @@ def _say(verdict: Verdict) -> dict[str, Any]:
 
 @contextmanager
 def _following(
-    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, archive: str | None, confirmations: int,
+    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, confirmations: int,
     confirm: bool, file: Path | None, choice: Choice, address: Address | None, turns: Sequence[Callable[[], object]],
 ) -> Iterator[tuple[Iterator[tuple[str, ProvenRecord]], dict[str, dict[str, Any]]]]:  # fmt: skip
     """Records as they are proven, until SIGINT or SIGTERM; and where the verdicts are when that has ended.
@@ -410,7 +393,7 @@ def _following(
     from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with _asking(place, nodes, archive, confirmations, file) as asked, ExitStack() as stack:
+    with _asking(place, nodes, confirmations, file) as asked, ExitStack() as stack:
         followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
         following = Following(followed, asked.ledgers)
         view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)

@@ -243,23 +243,11 @@ class BagConfig(Section):
     path: The bag. A relative path starts at the folder of this file.
 
     speed: Factor on the recorded pace, or `"max"`: as fast as records are taken.
-
-    start: Skip so much of the recording.
-
-    stop: End so long after the beginning of the recording.
     """
 
     kind: Literal["bag"]
     path: FilePath
     speed: Speed = 1.0
-    start: DurationNs | None = None
-    stop: DurationNs | None = None
-
-    @validator(mode="after")
-    def _consistent(self) -> BagConfig:
-        if self.start is not None and self.stop is not None and self.stop <= self.start:
-            raise ValueError("ends before it begins: `stop` is not after `start`")
-        return self
 
 
 class Ros1Config(Section):
@@ -331,7 +319,6 @@ class SimConfig(Section):
 
 AnySource: TypeAlias = BagConfig | Ros1Config | Ros2Config | SimConfig
 SOURCE_KINDS: dict[str, type[AnySource]] = {"bag": BagConfig, "ros1": Ros1Config, "ros2": Ros2Config, "sim": SimConfig}
-_ROS1_DISTRIBUTIONS = frozenset({"noetic", "melodic", "lunar", "kinetic", "jade", "indigo"})
 
 
 class LogConfig(Section):
@@ -380,7 +367,7 @@ class RobotConfig(Section):
     Keep it on the machine or a private network.
 
     source: Where messages come from (below). Without it, the ROS that the environment speaks of (`ROS_VERSION`,
-    `ROS_MASTER_URI`, `ROS_DISTRO`); where it speaks of none, the robot does not start.
+    `ROS_MASTER_URI`); where it speaks of none, the robot does not start.
 
     capture: How all topics are captured (below).
 
@@ -458,18 +445,15 @@ class RobotConfig(Section):
         """
         if self.source is not None:
             return self.source, "as configured"
-        version, distribution = environment.get("ROS_VERSION"), environment.get("ROS_DISTRO")
-        if version in ("1", "2"):
+        if (version := environment.get("ROS_VERSION")) in ("1", "2"):
             kind, why = f"ros{version}", f"ROS_VERSION is {version}"
         elif master := environment.get("ROS_MASTER_URI"):
             kind, why = "ros1", f"ROS_MASTER_URI is {master}"
-        elif distribution:
-            kind, why = "ros1" if distribution in _ROS1_DISTRIBUTIONS else "ros2", f"ROS_DISTRO is {distribution}"
         else:
             raise ConfigError(
-                "robot.toml has no [source] and the environment speaks of no ROS (ROS_VERSION, ROS_MASTER_URI,"
-                ' ROS_DISTRO): set ROS up in this shell, or write [source] with kind = "ros1", "ros2", "bag" or, to try'
-                ' it out with invented messages, "sim"'
+                "robot.toml has no [source] and the environment speaks of no ROS (ROS_VERSION, ROS_MASTER_URI): set ROS"
+                ' up in this shell, or write [source] with kind = "ros1", "ros2", "bag" or, to try it out with invented'
+                ' messages, "sim"'
             )
         return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
 

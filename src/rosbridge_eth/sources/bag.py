@@ -33,16 +33,14 @@ class BagSource(Source):
     """What of a bag is replayed, and how fast; it can be run again and then starts anew.
 
     speed: 1.0 is the recorded pace; None is as fast as messages are taken.
-    start, stop: replay [start, stop) of the recording, in ns from its first message.
     """
 
     kind = "bag"
     live = False
 
     def __init__(
-        self, path: Path, selection: Selection, clock: Clock | None = None, *,
-        speed: float | None = 1.0, start: int | None = None, stop: int | None = None,
-    ) -> None:  # fmt: skip
+        self, path: Path, selection: Selection, clock: Clock | None = None, *, speed: float | None = 1.0
+    ) -> None:
         """Opens the bag and resolves the selection. Raises SourceError."""
         self._speed, self._clock = speed, clock or Clock()
         self._where = f"bag {path}"
@@ -64,13 +62,8 @@ class BagSource(Source):
                 for connection in reader.connections
             ]
             self._distribution = reader.ros_distro if isinstance(reader, Rosbag2Reader) else None
-            begin, end = reader.start_time, reader.end_time
-        self._first, self._stop = begin + (start or 0), None if stop is None else begin + stop
-        self.span = (self._first, (end if self._stop is None else min(end, self._stop)) - 1)
-        """When the first and the last message can have been received that are replayed (ns since 1970).
-
-        The first is the later one where nothing is.
-        """
+        self.span = reader.start_time, reader.end_time - 1
+        """When the first and the last message were received (ns since 1970); of an empty bag the first is the later."""
         try:
             self._offers = self._read_offers()
             watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
@@ -78,13 +71,8 @@ class BagSource(Source):
         except SourceError:
             self.close()
             raise
-        if end <= begin:
+        if self.span[1] < self.span[0]:
             log.warning("%s holds no message", self._where)
-        elif self._first > self.span[1]:
-            log.warning(
-                "%s: nothing is replayed: start = %gs is after its last message; the recording lasts %.3f s",
-                self._where, (start or 0) / 1e9, (end - 1 - begin) / 1e9,
-            )
 
     def offers(self) -> Sequence[Offer]:
         """Every topic in the bag; a ROS 1 bag knows the nodes that published."""
@@ -111,7 +99,7 @@ class BagSource(Source):
         chosen = [connection for connection, _, _ in self._connections if connection.id in self._decoders]
         try:
             with self._translated():
-                for connection, received_ns, raw in self._reader.messages(chosen, self._first, self._stop):
+                for connection, received_ns, raw in self._reader.messages(chosen):
                     yield RawMessage(*topics[connection.id], received_ns, bytes(raw), self._decoders[connection.id])
         except SourceError:
             if self._reader is not None:  # else it was closed meanwhile, and is over

@@ -48,8 +48,6 @@ def test_one_line_is_a_whole_configuration():
         ({"ROS_VERSION": "1"}, "ros1", "ROS_VERSION is 1"),
         ({"ROS_VERSION": "2", "ROS_MASTER_URI": "http://robot:11311"}, "ros2", "ROS_VERSION is 2"),
         ({"ROS_MASTER_URI": "http://robot:11311"}, "ros1", "ROS_MASTER_URI is http://robot:11311"),
-        ({"ROS_DISTRO": "kilted"}, "ros2", "ROS_DISTRO is kilted"),
-        ({"ROS_DISTRO": "noetic"}, "ros1", "ROS_DISTRO is noetic"),
     ],
 )
 def test_without_a_source_the_environment_says_which(environment, kind, reason):
@@ -97,12 +95,12 @@ field_limit = "2 KiB"
 
 def test_a_bag_stands_relative_to_the_file():
     bag = 'topics = ["/a"]\n[source]\nkind = "bag"\n'
-    config = robot(bag + 'path = "x/y.bag"\nspeed = "max"\nstart = "1s"\nstop = "3s"')
+    config = robot(bag + 'path = "x/y.bag"\nspeed = "max"')
     told = config.source.model_dump(exclude={"kind"})
-    assert told == {"path": Path("/etc/rosbridge/x/y.bag"), "speed": None, "start": S, "stop": 3 * S}
+    assert told == {"path": Path("/etc/rosbridge/x/y.bag"), "speed": None}
     config = robot(bag + 'path = "/x/y.bag"\nspeed = 2')
     told = config.source.model_dump(exclude={"kind"})
-    assert told == {"path": Path("/x/y.bag"), "speed": 2.0, "start": None, "stop": None}
+    assert told == {"path": Path("/x/y.bag"), "speed": 2.0}
 
 
 KINDS = ", ".join(map(repr, SOURCE_KINDS))
@@ -154,14 +152,13 @@ store = "archiv"': "capture.store is 'archiv'; input should be 'chain' or 'archi
     'topics = ["/a"]\n[source]\nkind = "bog"': f"source needs a kind: {KINDS}",
     'topics = ["/a"]\n[source]\nspeed = "max"': f"source needs a kind: {KINDS}",
     'topics = ["/a"]\n[source]\nkind = "ros2"\nnode = "a/b"': "source.node is 'a/b'; a node's name has letters",
-    'topics = ["/a"]\n[source]\nkind = "ros2"\ndomain = 233': "source.domain is 233; input should be less than or equal to 232",
+    'topics = ["/a"]\n[source]\nkind = "ros2"\ndomain = 233': "source.domain is 233; input should be less than",
     'topics = ["/a"]\n[source]\nkind = 1': f"source needs a kind: {KINDS}",
     'topics = ["/a"]\n[source]\nkind = "bag"': "source.path is missing",
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = 5': "source.path is 5; write a path in quotes",
     'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nspeed = 0': (
         'source.speed is 0; write a factor above 0, such as 1.0 or 10, or "max"'
     ),
-    'topics = ["/a"]\n[source]\nkind = "bag"\npath = "x"\nstart = "5s"\nstop = "2s"': "source ends before it begins",
     'topics = ["/a"]\n[source]\nkind = "sim"\nrobot = "a/b"': "source.robot is 'a/b'; it becomes part of a topic's",
     'topics = ["/a"]\n[spool]\nmax_size = "64 mib"': "spool.max_size is '64 mib'; write a size such as",
     'topics = ["/a"]\n[source]\nkind = "ros2"\ndepth = 1.5': "source.depth is 1.5; input should be a valid integer",

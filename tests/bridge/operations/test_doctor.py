@@ -339,7 +339,7 @@ def test_a_full_disk_is_broken(place: Place, tmp_path: Path, capsys: Capture):
         assert "disk" in broken(doctor(capsys, "--home", str(home))[1]), "4 MiB are not enough either"
 
 
-@pytest.mark.parametrize("free, result", [(0, "broken"), (63 << 20, "broken"), (65 << 20, "note"), (2 << 30, "ok")])
+@pytest.mark.parametrize("free, result", [(0, "broken"), (63 << 20, "broken"), (65 << 20, "ok")])
 @pytest.mark.parametrize("inodes", [5, 0])
 def test_how_much_room_is_enough(monkeypatch: Patch, tmp_path: Path, free: int, result: str, inodes: int):
     found = os.statvfs(tmp_path)
@@ -351,7 +351,7 @@ def test_how_much_room_is_enough(monkeypatch: Patch, tmp_path: Path, free: int, 
 
 
 @pytest.mark.parametrize("off, result", [
-    (-86_400, "broken"), (86_400, "broken"), (7_200, "note"), (60, None), (-60, None),
+    (-86_400, "broken"), (86_400, "broken"), (7_200, None), (60, None), (-60, None),
 ])
 def test_a_clock_is_held_against_the_last_block(
     place: Place, on_chain: None, monkeypatch: Patch, capsys: Capture, off: float, result: str | None
@@ -393,12 +393,12 @@ def test_an_address_that_is_none_is_found_at_both_ends(place: Place, capsys: Cap
     assert of(findings, "bridge")["result"] == "ok"
 
 
-@pytest.mark.parametrize("told, result", [("0.0.0.0:7410", "broken"), ("192.0.2.1:7410", "note")])
-def test_a_bundle_that_names_another_address_is_found(place: Place, told: str, result: str, capsys: Capture):
+@pytest.mark.parametrize("told", ["0.0.0.0:7410", "192.0.2.1:7410"])
+def test_a_bundle_that_names_another_address_is_found(place: Place, told: str, capsys: Capture):
     path = place.operator.bundles / "robot_1.bundle"
     path.write_text(path.read_text().replace("127.0.0.1:9", told))
     _, findings = doctor(capsys)
-    assert of(findings, "bundle")["result"] == result and told in of(findings, "bundle")["found"]
+    assert of(findings, "bundle")["result"] == "note" and told in of(findings, "bundle")["found"]
     assert 'server = "127.0.0.1:9"' in of(findings, "bundle")["mend"]
 
 
@@ -450,17 +450,12 @@ def test_another_chain_with_the_same_id_has_its_mend(place: Place, keys: Keyring
 # The store
 
 
-def test_what_waits_is_on_hold_or_dead_is_told(place: Place, capsys: Capture):
+def test_what_waits_is_told(place: Place, capsys: Capture):
     inbox, tk = place.inbox(), robot_id("robot_1")
     inbox.append([(tk, chunk) for chunk in chunk_chain(3)], time.time())
-    inbox.set_state(tk, hold="it is revoked")
-    _, findings = doctor(capsys)
-    assert of(findings, "store")["found"].startswith("3 chunks")
-    assert of(findings, "on hold")["found"] == "robot_1: it is revoked"
-    inbox.bury(tk, None, "given up")
     inbox.close()
     _, findings = doctor(capsys)
-    assert "given up" in of(findings, "dead letters")["found"]
+    assert of(findings, "store")["found"] == "3 chunks wait"
 
 
 @pytest.mark.service

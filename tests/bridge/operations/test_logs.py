@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import logging
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.logs import LogFormat, Trouble, log_to, speaks_json
+from rosbridge_eth.logs import LogFormat, Trouble, log_to_stderr, speaks_json
 
 log = logging.getLogger("rosbridge_eth.server")
 
@@ -30,7 +31,8 @@ def _as_before() -> Iterator[None]:
 
 def lines(format: LogFormat, verbosity: int = 2) -> io.StringIO:
     stream = io.StringIO()
-    log_to(stream, format, verbosity)
+    with contextlib.redirect_stderr(stream):
+        log_to_stderr(format, verbosity)
     return stream
 
 
@@ -96,7 +98,8 @@ def test_a_log_that_is_copied_and_cut_short_goes_on_at_its_beginning(tmp_path: P
     """logrotate's copytruncate, of a file that the shell appends to."""
     file = tmp_path / "log"
     with file.open("a") as stream:
-        log_to(stream, LogFormat.JSON, 1)
+        with contextlib.redirect_stderr(stream):
+            log_to_stderr(LogFormat.JSON, 1)
         log.info("before")
         shutil.copy(file, tmp_path / "log.1")
         os.truncate(file, 0)
