@@ -264,8 +264,6 @@ def _reader_toml(ledger: Deployment, node: str) -> str:
         f'contract = "{ledger.contract}"\n'
         f"chain_id = {ledger.chain_id}\n"
         f'genesis = "{ledger.genesis}"\n'
-        'ca = "ca.crt.pem"\n'
-        'identity = "."\n'
         f'chain = ["{node}"]  # any nodes of this chain\n'
     )
 
@@ -319,15 +317,13 @@ def _make_reader(
 class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
-    own_keys: nobody but the robot can sign as it. unfunded: why its account was given no ETH, if it was not; the
-    server gives it some later. buried: chunks of the one that bore the name before which became dead letters.
+    unfunded: why its account was given no ETH, if it was not; the server gives it some later. buried: chunks of the one
+    that bore the name before which became dead letters.
     """
 
-    name: str
     account: str
     block: int
     bundle: Path
-    own_keys: bool
     unfunded: str | None
     buried: int
 
@@ -400,7 +396,7 @@ def register_robot(
         unfunded = "the operator's account has none for it"
     except ChainError as error:
         unfunded = str(error)
-    return Registered(name, account, block, path, request is not None, unfunded, buried)
+    return Registered(account, block, path, unfunded, buried)
 
 
 def _register(

@@ -33,7 +33,7 @@ from rosbridge_eth.logs import log_to_stderr
 from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
-from rosbridge_eth.terminal import Json, data, errors, print_json, table, talk
+from rosbridge_eth.terminal import data, errors, table, talk
 from rosbridge_eth.topics import robot_toml
 
 if TYPE_CHECKING:
@@ -236,7 +236,6 @@ def demo(
     topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
     loss: Annotated[float, typer.Option(
         min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")] = 0.0,
-    json: Json = False,
 ) -> None:
     """See it work: a bag onto a chain and back, proven and compared.
 
@@ -297,16 +296,7 @@ def demo(
     page = Console(record=True, file=io.StringIO(), width=140, highlight=False, emoji=False)
     page.print(*map(Text, (f"{passed} The bag is {chosen.name}.", *said)), *tables, sep="\n")
     page.save_html(str(report / "report.html"), code_format=PAGE)
-    if json:
-        print_json({
-            "passed": result.passed, "seconds": result.seconds, "times": stages.times,
-            "counts": {"captured": stages.captured, "chunks": stages.chunks, "verified": stages.verified},
-            "contract": result.contract, "verdict": result.verdict.as_json(),
-            "differences": list(result.comparison.differences),
-            "transactions": [dict(zip(heads, row, strict=True)) for row in batches],
-        })  # fmt: skip
-    else:
-        data.print(*tables)
+    data.print(*tables)
     for line in said:
         talk(line)
     if not result.passed:

@@ -76,7 +76,7 @@ ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note
 
 
 def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Findings:
-    """Run the checks one after the other; a failure of the bridge's own is a finding, and its text has the mend. What
+    """Run the checks one after the other; a failure of the bridge's own is a finding, whose text has the mend. What
     ends several checks is told once."""
     told = set[str]()
     for what, check in checks.items():
@@ -90,10 +90,7 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
             if str(error) in told:
                 continue
             told.add(str(error))
-            # What to do comes last: after a semicolon, after a reason in brackets, or as a second sentence.
-            parts = (str(error).partition(mark) for mark in ("; ", "): ", ". "))
-            found, mark, todo = next((part for part in parts if part[2]), (str(error), "", ""))
-            yield broken(what, found + mark.strip(".;: "), todo or "correct what this names")
+            yield broken(what, str(error))
 
 
 # The machine
@@ -158,27 +155,24 @@ def monitor(address: Address | None, runs: bool) -> Findings:
     """Is the port of /metrics free, or does the process that should have it answer there?"""
     if address is None:
         return
-    conditions, taken = dict[str, bool](), ""
-    with socket.socket(socket.AF_INET6 if ":" in address.host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(tuple(address))
-        except OSError as error:
-            taken = error.strerror or str(error)
-    if taken and runs:
-        with suppress(OSError, http.client.HTTPException, ValueError, LookupError, TypeError), closing(
-            http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)
-        ) as connection:
+    try:
+        if not runs:
+            socket.create_server(address, family=socket.AF_INET6 if ":" in address.host else socket.AF_INET).close()
+            yield ok("monitor", f"{address} is free")
+            return
+        with closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection:
             connection.request("GET", "/readyz")
-            conditions = dict(jsonlib.loads(connection.getresponse().read())["conditions"])
-    failing = [name for name, holds in conditions.items() if not holds]
-    if failing:
-        yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
-    elif conditions or not (taken or runs):
-        yield ok("monitor", f"{address} " + ("says ready" if conditions else "is free"))
-    else:
-        yield broken("monitor port", f"{address} is not answered by this home's process ({taken or 'nobody is there'})",
+            conditions = dict[str, bool](jsonlib.loads(connection.getresponse().read())["conditions"])
+        if not conditions:
+            raise ValueError("no conditions")
+    except (OSError, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
+        yield broken("monitor port", f"{address} is not answered by this home's process ({error})",
                      "stop what has the port, or correct `monitor`; then start again")
+        return
+    if failing := [name for name, holds in conditions.items() if not holds]:
+        yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
+    else:
+        yield ok("monitor", f"{address} says ready")
 
 
 def shake_hands(
@@ -415,12 +409,11 @@ def session(home: RobotHome, secret: bytes | None) -> Findings:
 
 
 def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
-    folder = load_reader_config(home.config).identity
-    yield from certificates(folder, "let the operator make this reader anew (`reader NAME --replace`)")
+    yield from certificates(home.path, "let the operator make this reader anew (`reader NAME --replace`)")
     if secret is None:
         yield skipped("passphrase", "none was given", "give --passphrase-file")
     else:
-        yield ok("passphrase", f"opens the keys of {ids.load_identity(folder, secret)[0].name}")
+        yield ok("passphrase", f"opens the keys of {ids.load_identity(home.path, secret)[0].name}")
 
 
 def reader_nodes(home: ReaderHome, secret: bytes | None) -> Findings:
@@ -479,7 +472,8 @@ def doctor(
     for finding in examine(checks, of(home), secret):
         findings.append(finding)
         if not json and finding.result != "ok":
-            talk(f"{_SIGN[finding.result]}: {finding.what}: {finding.found}; {finding.mend}")
+            told = "; ".join(filter(None, (finding.found, finding.mend)))
+            talk(f"{_SIGN[finding.result]}: {finding.what}: {told}")
     count = sum(finding.result == "broken" for finding in findings)
     if json:
         print_json({"home": str(home), "kind": kind, "broken": count, "findings": [f._asdict() for f in findings]})

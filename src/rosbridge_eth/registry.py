@@ -191,7 +191,3 @@ class Registry:
     def in_force(self) -> dict[bytes, bytes]:
         """Every robot in force: Tk to keccak256 of its certificates. StoreError as `revision`."""
         return {tk: robot.hash for tk, robot in self.robots().items() if robot.revoked_at is None}
-
-    def names(self) -> dict[bytes, str]:
-        """Every robot there ever was: Tk to its name."""
-        return {tk: robot.name for tk, robot in self.robots().items()}

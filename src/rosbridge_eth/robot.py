@@ -18,7 +18,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 from rosbridge_eth.blackbox import BlackBox
@@ -400,7 +399,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     )
 
 
-def read_again(robot: Robot, home: RobotHome, running: RobotConfig, file: Path) -> RobotConfig:
+def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConfig:
     """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, triggers,
     [capture] and readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from
     now on.
@@ -409,7 +408,7 @@ def read_again(robot: Robot, home: RobotHome, running: RobotConfig, file: Path) 
     """
     keys = [*(("topics", "nodes", "trigger") if robot.source.live else ()), "capture", "readers"]
     try:
-        config, said = reread(running, load_robot_config(file), keys)
+        config, said = reread(running, load_robot_config(home.config), keys)
         roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
         robot.take_up(config, reader_keys(config, home, roots))
     except (BridgeError, OSError) as error:

@@ -18,11 +18,11 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosbridge_eth.chunk import Chunk, Log, robot_id
-from rosbridge_eth.config import ServerConfig, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config import ServerConfig, load_robot_config, load_server_config
 from rosbridge_eth.config.values import counted
 from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
-from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.home import HomeKind, OperatorHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role
 from rosbridge_eth.registry import Enrolment, Registry
 from rosbridge_eth.spool import Spool
@@ -70,7 +70,7 @@ def locate(home: OperatorHome, ledger: Ledger, robot: str, stream: str, number: 
 
     config, tk = load_server_config(home.config), robot_id(robot)
     with Registry(home.registry) as registry:
-        if tk not in registry.names():
+        if tk not in registry.robots():
             raise IdentityError(f"no robot {robot!r} is enrolled; `status` lists the names")
     if len(stream) != 32 or not set(stream.lower()) <= set("0123456789abcdef"):
         raise ConfigError(f"the stream is 32 hex digits, as `read --json` shows it, not {stream!r}")
@@ -157,16 +157,6 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
             of[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
 
 
-def _head(report: Report, ledger: Ledger) -> None:
-    head = ledger.block()
-    report["node"] = {"url": ledger.url, "block": head.number, "age_seconds": max(0.0, time.time() - head.time)}
-    try:
-        ledger.check()
-    except ChainError as error:
-        report["wrong_chain"] = str(error)
-        raise
-
-
 def _operator(place: OperatorHome) -> Report:
     from rosbridge_eth.ledger import Ledger
 
@@ -193,7 +183,14 @@ def _operator(place: OperatorHome) -> Report:
         with _asking(report, "the chain"), closing(
             Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
         ) as ledger:
-            _head(report, ledger)
+            head = ledger.block()
+            age = max(0.0, time.time() - head.time)
+            report["node"] = {"url": ledger.url, "block": head.number, "age_seconds": age}
+            try:
+                ledger.check()
+            except ChainError as error:
+                report["wrong_chain"] = str(error)
+                raise
             _add_standings(report, ledger, robots, round(config.funds.by * _WEI))
     report["alarms"] = [*_alarms(report)]
     return report
@@ -295,18 +292,6 @@ def _robot(place: RobotHome) -> Report:
     return report
 
 
-def _reader(place: ReaderHome) -> Report:
-    from rosbridge_eth.ledger import Ledger
-
-    config = load_reader_config(place.config)
-    report: Report = {"contract": config.contract, "chain": config.chain_id, "nodes": [], "unknown": []}
-    for url in config.chain:
-        with _asking(report, "a node"), closing(Ledger.connect(url, config, timeout=ANSWER_TIME)) as ledger:
-            _head(report, ledger)
-            report["nodes"].append(report.pop("node"))
-    return report
-
-
 # What is shown
 
 
@@ -316,11 +301,6 @@ def span(seconds: float | None) -> str:
         if seconds is not None and seconds >= 2 * unit:
             return f"{round(seconds / unit)}{name}"
     return "" if seconds is None else f"{round(seconds)}s"
-
-
-def _block(node: Mapping[str, Any] | None) -> tuple[str, object]:
-    known = node is not None and f"{node['block']}, {span(node['age_seconds'])} old, at {node['url']}"
-    return "last block", known or "not known"
 
 
 def _process(report: Report) -> list[tuple[str, object]]:
@@ -352,12 +332,14 @@ def _figure(of: Mapping[str, Any], key: str, form: str) -> str:
 def _show_operator(report: Report) -> Iterator[RenderableType]:
     yield _robots(report)
     eth, days, contract = report["operator"]["eth"], report["operator"]["days_left"], report["contract"]
+    node = report["node"]
+    head = f"{node['block']}, {span(node['age_seconds'])} old, at {node['url']}" if node else "not known"
     others = [f"{each['role']} {each['name']}" for each in report["names"]
               if each["role"] != Role.ROBOT and each["revoked"] is None]  # fmt: skip
     treasury = "not known" if eth is None else f"{eth:.4f} ETH" + (f", for {days:.1f} days" if days is not None else "")
     yield table("Server", ["what", "value"], [
         ("contract", f"{contract} on chain {report['chain']}" if contract else "none yet; run `deploy`"),
-        _block(report["node"]), ("treasury", treasury),
+        ("last block", head), ("treasury", treasury),
         ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
         *_process(report),
     ])  # fmt: skip
@@ -381,11 +363,6 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
     ])  # fmt: skip
 
 
-def _show_reader(report: Report) -> Iterator[RenderableType]:
-    contract = ("contract", f"{report['contract']} on chain {report['chain']}")
-    yield table("Reader", ["what", "value"], [contract, *map(_block, report["nodes"] or [None])])
-
-
 def _look(path: Path) -> tuple[Report, list[RenderableType]]:
     """The report on a home, and how it is shown."""
     kind = kind_of(path)
@@ -395,7 +372,7 @@ def _look(path: Path) -> tuple[Report, list[RenderableType]]:
         case HomeKind.ROBOT:
             shown = _show_robot(report := _robot(RobotHome(path)))
         case HomeKind.READER:
-            shown = _show_reader(report := _reader(ReaderHome(path)))
+            raise ConfigError(f"a reader's home has nothing that goes on; try it with `doctor --home {path}`")
     return {"kind": kind, **report}, [Text(each) if isinstance(each, str) else each for each in shown]
 
 
@@ -408,7 +385,7 @@ def status(
     follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
     json: Json = False,
 ) -> None:
-    """Show what is where: robots, what waits, balances, alarms. Of any home.
+    """Show what is where: robots, what waits, balances, alarms. Of an operator's home, or a robot's.
 
     What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
     another chain than the contract.

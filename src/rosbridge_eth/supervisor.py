@@ -57,7 +57,7 @@ GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
 PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
 """Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
 
-TAKEN_UP = ("channel", "chain", "store", "archive", "funds", "limits")
+TAKEN_UP = ("channel", "chain", "store", "archive", "funds")
 """Keys of server.toml that SIGHUP takes up: those that the parent, its sockets and certificates do not rest on."""
 
 SUBMITTER, MONITOR = "submitter", "monitor"
@@ -99,11 +99,7 @@ def open_reception(
     deployment: Deployment,
 ) -> Reception:  # fmt: skip
     """The door of one worker."""
-    limits = config.limits
-    channel = ServerConfig(
-        modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number, max_connections=limits.connections,
-        handshake_share=limits.handshake_share, source_rate=limits.source_rate,
-    )
+    channel = ServerConfig(modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number)
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
     archive = None if config.archive is None else open_archive(config.archive)
     return Reception(server, inbox, deployment.ledger, registry.in_force, archive)

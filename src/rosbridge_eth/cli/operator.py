@@ -261,7 +261,7 @@ def register(
             password=secret, replace=replace, compromised=compromised,
         )  # fmt: skip
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
-    if not made.own_keys:
+    if asked is None:
         talk(f"Its keys were made here: who has this home and its passphrase can sign as {name}.")
     if made.unfunded:
         talk(f"It was given no ETH yet ({made.unfunded}); nothing is written for it until the server can give it some.")

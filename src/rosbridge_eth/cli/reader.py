@@ -334,7 +334,7 @@ def _asking(
     from rosbridge_eth.reading.grant import open_folder
 
     config = load_reader_config(place.config)
-    identity, roots = load_identity(config.identity, read_passphrase("reader", "Passphrase of the reader", file=file))
+    identity, roots = load_identity(place.path, read_passphrase("reader", "Passphrase of the reader", file=file))
     trust = Trust(roots)
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
     bookmarks = Bookmarks(place.path / "bookmarks.json")

@@ -144,7 +144,6 @@ def _say_who(fingerprint: str) -> None:
 
 def robot(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
-    config: Annotated[Path | None, typer.Option(help="Use this file instead of robot.toml.")] = None,
     password_file: terminal.PasswordFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
@@ -161,8 +160,7 @@ def robot(
     if fingerprint := bundles.take_up(place):
         _say_who(fingerprint)
     end = place.bridge()
-    file = config or place.config
-    settings = load_robot_config(file)
+    settings = load_robot_config(place.config)
     source, why = settings.source_and_why(os.environ)
     talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
     password = read_passphrase("robot", f"Password of {end.robot}", file=password_file)
@@ -194,7 +192,7 @@ def robot(
             nonlocal settings, told
             if again.is_set():
                 again.clear()
-                settings = read_again(running, place, settings, file)
+                settings = read_again(running, place, settings)
             if event.is_set():
                 event.clear()
                 running.fire("SIGUSR1")

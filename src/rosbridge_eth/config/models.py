@@ -530,21 +530,6 @@ class FundsConfig(Section):
     gas_per_day: int = Field(default=30_000_000_000, ge=1_000_000)
 
 
-class LimitsConfig(Section):
-    """Bounds on what strangers and robots can make the server do; per worker process.
-
-    connections: Sessions.
-
-    handshake_share: Share of time that handshakes may take.
-
-    source_rate: Handshakes per second that one address may fail, and 40 times as many at once.
-    """
-
-    connections: int = Field(default=4096, ge=1)
-    handshake_share: float = Field(default=0.5, gt=0, le=1)
-    source_rate: float = Field(default=10.0, gt=0)
-
-
 class ServerConfig(Section):
     """The server's configuration, `server.toml`.
 
@@ -571,8 +556,6 @@ class ServerConfig(Section):
     archive: Where the bodies of archived chunks rest (below).
 
     funds: Robots' accounts (below).
-
-    limits: Bounds (below).
     """
 
     listen: HostPort = Address("0.0.0.0", 7410)  # noqa: S104 - a server's default
@@ -586,7 +569,6 @@ class ServerConfig(Section):
     store: StoreConfig = StoreConfig()
     archive: ArchiveConfig | None = None
     funds: FundsConfig = FundsConfig()
-    limits: LimitsConfig = LimitsConfig()
 
     def address_for_robots(self) -> Address:
         """`public`, or `listen`; ConfigError where that is no address that a robot could send to."""
@@ -611,10 +593,6 @@ class ReaderConfig(Section):
 
     genesis: The hash of the chain's first block, which every signature covers, too.
 
-    ca: The operator's CA certificate (PEM).
-
-    identity: Folder of the reader's keys and certificates.
-
     chain: JSON-RPC URL of a node of the chain, or a list of them: all are asked, the highest count holds, and where
     they disagree it is told.
 
@@ -624,8 +602,6 @@ class ReaderConfig(Section):
     contract: ContractAddress
     chain_id: int = Field(ge=1)
     genesis: Hash
-    ca: FilePath
-    identity: FilePath
     chain: Annotated[list[NodeUrl], BeforeValidator(_listed)] = Field(
         default=["http://127.0.0.1:8545"], min_length=1, repr=False
     )

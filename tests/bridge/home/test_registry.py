@@ -58,7 +58,7 @@ def test_what_the_submitter_and_the_server_ask(registry: Registry) -> None:
     second = enrol(registry, "robot_2")
     newest = enrol(registry, "robot_1", replace=True)
     registry.revoke(Role.ROBOT, "robot_2", NOON)
-    assert registry.names() == {robot_id("robot_1"): "robot_1", robot_id("robot_2"): "robot_2"}
+    assert [*registry.robots()] == [robot_id("robot_1"), robot_id("robot_2")]
     robots = registry.robots()
     assert {tk: (robot.number, robot.revoked_at) for tk, robot in robots.items()} == {
         robot_id("robot_1"): (5, None), robot_id("robot_2"): (4, NOON.isoformat()),

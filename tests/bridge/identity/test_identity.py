@@ -63,7 +63,7 @@ def test_a_pem_file_names_its_identity():
     ("change", "error"),
     [
         ({"role": ids.Role.SERVER}, ids.UntrustedCertificate),
-        ({"role": (ids.Role.READER, ids.Role.OPERATOR)}, ids.UntrustedCertificate),
+        ({"role": (ids.Role.READER, ids.Role.SERVER)}, ids.UntrustedCertificate),
         ({"name": "robot_2"}, ids.UntrustedCertificate),
         ({"at": BIRTH - timedelta(days=1, seconds=1)}, ids.ExpiredCertificate),
         ({"at": BIRTH + timedelta(days=826)}, ids.ExpiredCertificate),

@@ -269,7 +269,6 @@ def test_sighup_takes_up_server_toml_and_the_robots_go_on(bridge: Bridge):
         bridge.server.send_signal(signal.SIGHUP)
         bridge.until("refused", lambda: bridge.said("server.log", "nothing is taken up") == 1)
         assert bridge.figures()["starts"] == before
-        config.write_text(good.replace("[chain]", "workers = 3\n[limits]\nconnections = 0\n[chain]"))
         config.write_text(good.replace("[chain]", "workers = 3\n[chain]\nconfirmations = 2"))
         bridge.server.send_signal(signal.SIGHUP)
         bridge.until("taken up", lambda: bridge.said("server.log", "taken up: channel, chain,") == 1)

@@ -193,7 +193,6 @@ def test_the_node_on_another_chain_is_told_by_the_exit_code_and_the_rest_is_show
     assert run(["status"]) == ExitCode.CHAIN
     shown = capsys.readouterr()
     assert "robot_1" in shown.out and "another chain" in shown.err
-    assert status(capsys, "--home", "reader", code=ExitCode.CHAIN)["wrong_chain"]
 
 
 @pytest.mark.service
@@ -286,7 +285,7 @@ def test_how_fast_a_count_grows_is_what_it_grew_by_in_the_last_ten_looks():
     assert rates.of("a", 245, 30) == 4.5 and rates.of("b", 7, 30) == 0.0
 
 
-# A robot's and a reader's home
+# A robot's home
 
 
 def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys: Capture):
@@ -331,12 +330,9 @@ def test_a_robot_without_its_bundle_is_told_what_is_next(place: Place, capsys: C
     assert "register" in capsys.readouterr().err
 
 
-def test_a_reader_sees_its_nodes(place: Place, monkeypatch: Patch, capsys: Capture):
-    report = status(capsys, "--home", "reader")
-    assert report["kind"] == "reader" and report["nodes"] == [] and "127.0.0.1:9" in report["unknown"][0]
-    connect = Ledger.connect
-    monkeypatch.setattr(Ledger, "connect", lambda where, at, **more: connect(place.chain, at, **more))
-    assert status(capsys, "--home", "reader")["nodes"][0]["block"] == place.ledger.block_number()
+def test_of_a_reader_doctor_tells(place: Place, capsys: Capture):
+    assert run(["status", "--home", "reader"]) == ExitCode.CONFIG
+    assert "doctor --home reader" in capsys.readouterr().err
 
 
 def test_follow_looks_again_until_it_is_interrupted(place: Place, monkeypatch: Patch, capsys: Capture):
