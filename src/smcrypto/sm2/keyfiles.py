@@ -241,7 +241,7 @@ def _require_pair(d: int, point: bytes) -> None:
     [P] = to_affine_all([secret_sum(SM2P256V1, (d, base_comb(SM2P256V1)))], SM2P256V1)
     expected = encode_point(P, SM2P256V1, compressed=len(point) == 33)
     if not hmac.compare_digest(expected, point):
-        raise InvalidEncoding("the public key inside does not belong to the private key")
+        raise InvalidEncoding("the public key inside is of another key, or its point does not begin with 04, 02 or 03")
 
 
 def _read_algorithm(reader: der.Reader) -> None:

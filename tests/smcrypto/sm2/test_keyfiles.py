@@ -339,6 +339,11 @@ def test_private_keys_that_are_refused(case: str) -> None:
             sm2.PrivateKey.from_pem(pem.encode(label, WRONG_PRIVATE[case]))
 
 
+def test_a_hybrid_point_of_the_right_key_is_not_said_to_be_of_another() -> None:
+    with pytest.raises(InvalidKey, match="or its point does not begin with 04, 02 or 03"):  # ec -conv_form hybrid
+        sm2.PrivateKey.from_der(WRONG_PRIVATE["a hybrid public key"])
+
+
 @pytest.mark.parametrize(
     "data",
     [
