@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from base64 import b64decode
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy
@@ -49,6 +49,8 @@ class Restoration:
 
     def __init__(self, captured: Decoder, wire: Wire | None = None) -> None:
         """VerificationError for a type that this wire cannot have."""
+        if (wire or captured.wire) is Wire.ROS1 and any("/msg/" not in name for name in captured.fields):
+            raise VerificationError(f"{captured.type_name}: ROS 1 has no messages of actions and services")
         self.decoder = captured if wire in (None, captured.wire) else _rewired(captured, wire)
         # Of a header, what may stand in the data beside its fields, and what need not.
         rewired = self.decoder is not captured
@@ -62,7 +64,8 @@ class Restoration:
         message = self._build(data, missing)
         return Restored(message, tuple(missing))
 
-    def connection(self) -> dict[str, Any]:
+    @cached_property
+    def connection(self) -> dict[str, str]:
         """What `add_connection` of rosbags' writers is to know of the type, besides topic and name."""
         definition = self.decoder.definition
         if self.decoder.wire is Wire.ROS1:
@@ -178,8 +181,6 @@ def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
         header = [field for field in types[HEADER] if field[0] != "seq"]
         types[HEADER] = [("seq", (Nodetype.BASE, ("uint32", 0))), *header] if ros1 else header
     try:
-        if ros1 and any("/msg/" not in name for name in types):
-            raise SourceError("ROS 1 has no messages of actions and services")
         text = write_text(captured.type_name, types, ros1=ros1)
         return Decoder(wire or captured.wire, check_types(captured.type_name, types, text))
     except SourceError as error:

@@ -11,7 +11,8 @@ A bag says no more than what was recorded:
     TOPIC/json        std_msgs/String  records of which no message can be made: the record's JSON
     /rosbridge_eth/notes  std_msgs/String  once for each topic that is not whole: which fields are zero, or why JSON
 
-The definitions of the types come from the log itself. A ROS 1 record in a ROS 2 bag is a message, too, and the other
+The definitions of the types come from the log itself; in a ROS 2 bag a type has one, the first, and records under another
+are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other
 way round.
 """
 
@@ -43,7 +44,7 @@ from rosbridge_eth.capture.restoration import NOT_FINITE
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ConfigError, SourceError, VerificationError
 from rosbridge_eth.reading.verdict import printable, shown
-from rosbridge_eth.reading.verify import ProvenRecord
+from rosbridge_eth.reading.verify import MAX_TYPES, ProvenRecord
 
 NOTES: Final = "/rosbridge_eth/notes"
 MAX_NOTES: Final = 1_000
@@ -337,8 +338,9 @@ class Bag:
 
     def __init__(self, writer: Any, wire: Wire) -> None:
         self._writer, self._wire = writer, wire
-        self._connections: dict[tuple[str, Restoration], Any] = {}
+        self._connections: dict[tuple[str, ...], Any] = {}
         self._restorations: dict[tuple[str, TypeLine | None], Restoration | str] = {}
+        self._definitions: dict[str, str] = {}  # of a ROS 2 bag, which has one of each type
         self._notes: dict[str, None] = {}
         self._last = 0
         self._string = self._restoration(_STRING, None)
@@ -361,10 +363,12 @@ class Bag:
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
-        topic = printable(content.topic)
+        topic = printable(content.topic) or "/"
         time = max(0, min(content.received_ns, _LAST_TIME[self._wire]))
         key = content.type_name, record.definition
         if key not in self._restorations:
+            if len(self._restorations) == MAX_TYPES:
+                self._restorations.clear()
             try:
                 self._restorations[key] = self._restoration(*key)
             except (SourceError, VerificationError) as error:
@@ -392,13 +396,17 @@ class Bag:
         decoder = decoder_for_known(self._wire, type_name) if line is None else line.decoder()
         if decoder is None:
             raise VerificationError(f"{type_name} is not known here")
-        return Restoration(decoder, self._wire)
+        made = Restoration(decoder, self._wire)
+        known = made.connection.get("rihs01", "")
+        if self._definitions.setdefault(made.decoder.type_name, known) != known:
+            raise VerificationError(f"{type_name} has another definition in this bag")
+        return made
 
     def _put(self, topic: str, restoration: Restoration, message: Any, time: int) -> None:
-        key = topic, restoration
+        type_name, of = restoration.decoder.type_name, restoration.connection
+        key = topic, type_name, of.get("md5sum", "")
         if key not in self._connections:
-            of = restoration.connection()
-            self._connections[key] = self._writer.add_connection(topic, restoration.decoder.type_name, **of)
+            self._connections[key] = self._writer.add_connection(topic, type_name, **of)
         self._writer.write(self._connections[key], time, restoration.decoder.encode(message))
         self._last = max(self._last, time)
 

@@ -39,4 +39,4 @@ def test_every_message_has_the_values_that_ros_reads(messages):
         # Back from the line of the type alone, as a reader has it.
         restoration = Restoration(parse_line(definition_line(decoder)).decoder())
         assert restoration.decoder.encode(restoration.restore(data).message) == raw, message["type"]
-        assert restoration.connection()["md5sum"] == message["md5"], message["type"]
+        assert restoration.connection["md5sum"] == message["md5"], message["type"]

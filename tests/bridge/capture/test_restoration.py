@@ -206,13 +206,13 @@ def test_types_are_to_ros_what_they_are_to_it():
             continue  # it was changed between them
         try:
             from_ros2 = decoder_for_known(Wire.CDR, name, "kilted")
-            rewired = Restoration(decoder_for_known(Wire.ROS1, name), Wire.CDR).connection()
+            rewired = Restoration(decoder_for_known(Wire.ROS1, name), Wire.CDR).connection
         except Exception as error:
             assert "wstring" in str(error)
             continue
         if rewired["rihs01"] == kilted.hash_rihs01(name):
             compared += 1
-            assert Restoration(from_ros2).connection()["rihs01"] == rewired["rihs01"]
+            assert Restoration(from_ros2).connection["rihs01"] == rewired["rihs01"]
     assert compared > 60
 
 
@@ -239,7 +239,7 @@ def test_a_type_that_nobody_knows_becomes_a_bag_of_any_kind(tmp_path: Path, kind
     path = tmp_path / ("some.bag" if kind == "bag" else "some")
     plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
     with rosbag1.Writer(path) if kind == "bag" else rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
-        connection = writer.add_connection("/t", decoder.type_name, **restoration.connection())
+        connection = writer.add_connection("/t", decoder.type_name, **restoration.connection)
         writer.write(connection, 1, restoration.decoder.encode(restoration.restore(data).message))
     with AnyReader([path]) as reader:
         [(connection, _, raw)] = reader.messages()

@@ -273,6 +273,39 @@ def test_two_definitions_of_one_name_stay_apart(tmp_path):
     first, second = (TypeLine("a_msgs/msg/A", "ros1", "msg", f"int32 {name}\n") for name in "xy")
     records = [record(1, "a_msgs/msg/A", {"x": 1}, "/a", first), record(2, "a_msgs/msg/A", {"y": 2}, "/a", second)]
     assert write_bag(tmp_path / "out.bag", records).whole == 2
+    made = write_bag(tmp_path / "out.mcap", records)  # where readers know a type by its name
+    assert (made.whole, made.as_json) == (1, 1) and "another definition" in made.notes[0]
+    assert [(topic, kind) for topic, kind, _, _ in messages(tmp_path / "out.mcap")][:2] == [
+        ("/a", "a_msgs/msg/A"), ("/a/json", "std_msgs/msg/String")]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAGS)
+def test_one_topic_under_two_texts_of_one_definition(tmp_path, name):
+    """A robot that went from ROS 1 to ROS 2, another comment, no definition at all, a topic that is named as ours."""
+    texts = [TypeLine("std_msgs/msg/String", wire, "msg", text) for wire, text in (
+        (Wire.ROS1, "string data\n"), (Wire.CDR, "string data\n"), (Wire.CDR, "# What is said\nstring data\n"))]
+    said = [record(n, "std_msgs/msg/String", {"data": str(n)}, "/t/json", one) for n, one in enumerate([*texts, None])]
+    assert write_bag(tmp_path / name, [*said, record(9, "x/msg/None", {}), record(10, "x/msg/None", {}, "")]).whole == 4
+    found = messages(tmp_path / name)
+    assert [message.data for topic, _, _, message in found if topic == "/t/json"][:4] == ["0", "1", "2", "3"]
+    assert len(found) == 6 + 2  # and the notes
+
+
+def test_a_service_s_message_of_ros_1_is_json(tmp_path):
+    """There are none; rosbags ends in an AssertionError at one."""
+    request = TypeLine("x_msgs/srv/A_Request", "ros1", "msg", "int32 n\n")
+    one = record(1, request.type_name, {"n": 1}, "/t", request)
+    assert write_bag(tmp_path / "out.bag", [one]).as_json == 1
+
+
+def test_types_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "MAX_TYPES", 8)
+    with outputs.bag(tmp_path / "out.mcap") as bag:
+        for n in range(40):
+            bag.write(record(n, f"x/msg/T{n % 20}", {}))
+            bag.write(point(n))
+        assert len(bag._restorations) <= 8
+    assert (bag.summary.whole, bag.summary.as_json) == (40, 40)
 
 
 @pytest.mark.parametrize("name", BAGS)
