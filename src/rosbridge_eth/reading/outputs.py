@@ -11,9 +11,8 @@ A bag says no more than what was recorded:
     TOPIC/json        std_msgs/String  records of which no message can be made: the record's JSON
     /rosbridge_eth/notes  std_msgs/String  once for each topic that is not whole: which fields are zero, or why JSON
 
-The definitions of the types come from the log itself; in a ROS 2 bag a type has one, the first, and records under another
-are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other
-way round.
+The definitions of the types come from the log itself; a ROS 2 bag has one of each type, the first, and records under
+another are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other way round.
 """
 
 from __future__ import annotations
