@@ -80,7 +80,7 @@ class Registry:
             self._robots: tuple[tuple[int, int], dict[bytes, Enrolment]] | None = None  # by revision
             begun = set(self._db.execute("SELECT role, name FROM enrolment"))
         except (sqlite3.Error, OSError) as error:
-            if path.exists() and getattr(error, "sqlite_errorcode", 0) & 0xFF not in DAMAGED:
+            if (new or path.exists()) and getattr(error, "sqlite_errorcode", 0) & 0xFF not in DAMAGED:
                 raise StoreError(f"the registry {path} cannot be used: {error}; see that you may write it") from error
             raise StoreError(self._lost(f"it cannot be used as a database, {error}")) from error
         if not new and (("reader", OWNER) not in begun or "server" not in {role for role, _ in begun}):

@@ -108,6 +108,11 @@ def test_one_that_cannot_be_opened_is_not_said_to_be_damaged(tmp_path: Path) -> 
     assert "backup" not in str(caught.value)
 
 
+def test_a_registry_that_cannot_be_made_is_not_said_to_be_lost(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="cannot be used: unable to open database file"):
+        Registry(tmp_path / "absent" / "registry.sqlite", new=True)
+
+
 @pytest.mark.parametrize("harm", ["deleted", "emptied", "made anew", "of another robot"])
 def test_a_registry_that_was_lost_is_not_taken_for_a_new_one(registry: Registry, tmp_path: Path, harm: str) -> None:
     enrol(registry, "robot_1")
