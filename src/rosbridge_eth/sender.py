@@ -36,7 +36,7 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
         case Reason.EXPIRED:
             return "see to this machine's clock; if the certificates have expired, have the robot registered again"
         case Reason.FULL:
-            return "wait, or ask the operator for more [limits] connections"
+            return "wait, or ask the operator for more `workers` (server.toml)"
         case _:
             return (
                 "is it up, is the address right, is UDP let through, and does it take"
