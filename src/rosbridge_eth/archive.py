@@ -41,16 +41,12 @@ class Archive(Protocol):
     def get(self, digest: bytes, length: int) -> bytes | None:
         """What is there by this name, cut off one byte behind `length`; None where nothing is."""
 
-    def delete(self, digest: bytes) -> None:
-        """Remove it, if it is there."""
-
-    def check(self) -> bytes:
-        """Put an object and read it; its digest, which is always the same: where nothing is deleted it stays one."""
+    def check(self) -> None:
+        """Put an object and read it; it is always the same, so it stays one."""
         digest = sm3.digest(PROBE)
         self.put(digest, PROBE)
         if self.get(digest, len(PROBE)) != PROBE:
             raise ArchiveAway(f"{self} does not give back what it was given")
-        return digest
 
 
 class Folder(Archive):
@@ -90,10 +86,6 @@ class Folder(Archive):
                 return None
             with path.open("rb") as file:
                 return file.read(length + 1)
-
-    def delete(self, digest: bytes) -> None:
-        with self._using(digest) as path:
-            path.unlink(missing_ok=True)
 
 
 class Bucket(Archive):
@@ -146,10 +138,6 @@ class Bucket(Archive):
                 if "NoSuchBucket" in str(error):  # nothing is known of what it holds
                     raise
                 return None
-
-    def delete(self, digest: bytes) -> None:
-        with self._using():
-            self._obstore.delete(self._store, _name(digest))
 
 
 def open_archive(config: ArchiveConfig) -> Archive:

@@ -42,9 +42,9 @@ INSERT OR IGNORE INTO held VALUES (2, 0, 0, 0), (3, 0, 0, 0), (4, 0, 0, 0), (5, 
 CREATE TRIGGER IF NOT EXISTS added AFTER INSERT ON chunk BEGIN {more} END;
 CREATE TRIGGER IF NOT EXISTS removed AFTER DELETE ON chunk BEGIN {less} END;
 CREATE TRIGGER IF NOT EXISTS changed AFTER UPDATE ON chunk BEGIN {less} {more} END;
--- One row: whose log, the newest header ever appended, and what was dropped since the spool was made.
+-- One row: whose log, the newest header ever appended, and how many bodies were dropped since the spool was made.
 CREATE TABLE IF NOT EXISTS spool (
-    ledger BLOB, tk BLOB, last BLOB, dropped_bodies INTEGER, dropped_headers INTEGER, dropped_records INTEGER
+    ledger BLOB, tk BLOB, last BLOB, dropped_bodies INTEGER
 );
 """.format(
     more="UPDATE held SET chunks = chunks + 1, records = records + new.records, bytes = bytes + new.size"
@@ -52,6 +52,9 @@ CREATE TABLE IF NOT EXISTS spool (
     less="UPDATE held SET chunks = chunks - 1, records = records - old.records, bytes = bytes - old.size"
     " WHERE state = old.state;",
 )
+_MAKE: Final = """
+INSERT INTO spool (ledger, tk, last, dropped_bodies) SELECT ?, ?, ?, 0 WHERE NOT EXISTS (SELECT 1 FROM spool)
+"""
 _OLDEST: Final = "SELECT position, chunk FROM chunk WHERE state = ? ORDER BY position LIMIT 1"
 # The place in the log of a stream's newest chunk up to a number.
 _UP_TO: Final = "(SELECT position FROM chunk WHERE stream = ? AND number <= ? ORDER BY number DESC LIMIT 1)"
@@ -60,8 +63,7 @@ _UP_TO: Final = "(SELECT position FROM chunk WHERE stream = ? AND number <= ? OR
 class SpoolStatistics(NamedTuple):
     """What is in the spool; unstored: chunks that the server does not have, as far as is known; aside: refused ones.
 
-    dropped_*: since the spool was made, what was removed although the server did not have it; records: those that
-    went with the bodies.
+    dropped_bodies: since the spool was made, those that were removed although the server did not have them.
     """
 
     chunks: int
@@ -70,8 +72,6 @@ class SpoolStatistics(NamedTuple):
     unstored: int
     aside: int
     dropped_bodies: int
-    dropped_headers: int
-    dropped_records: int
 
 
 class Spool:
@@ -91,8 +91,7 @@ class Spool:
         )
         try:
             if not read_only:
-                make = "INSERT INTO spool SELECT ?, ?, ?, 0, 0, 0 WHERE NOT EXISTS (SELECT 1 FROM spool)"
-                self._db.write(lambda: self._db.run(make, (*log, bytes(32))))
+                self._db.write(lambda: self._db.run(_MAKE, (*log, bytes(32))))
             with self._db.errors():
                 row = self._db.one("SELECT ledger, tk, last FROM spool") or (*log, bytes(32))
             if row[:2] != log:
@@ -149,11 +148,7 @@ class Spool:
         if state == _WHOLE:  # put back: an UPDATE would leave it a page of its own
             self._insert(position, self._drop(chunk))
         if state != _STORED:
-            self._db.run(
-                "UPDATE spool SET dropped_bodies = dropped_bodies + ?, dropped_headers = dropped_headers + ?,"
-                " dropped_records = dropped_records + ?",
-                (bool(chunk.body), state != _WHOLE, chunk.header.records if chunk.body else 0),
-            )
+            self._db.run("UPDATE spool SET dropped_bodies = dropped_bodies + ?", (bool(chunk.body),))
 
     def next_stream(self, stream: bytes) -> tuple[bytes, int, bytes] | None:
         """Stream, number and digest of the oldest chunk that is not set aside, of the streams that begin after this
@@ -214,7 +209,7 @@ class Spool:
         """What is in the spool at this moment."""
         with self._db.errors():
             held = {row[0]: row[1:] for row in self._db.run("SELECT * FROM held")}
-            dropped = self._db.one("SELECT dropped_bodies, dropped_headers, dropped_records FROM spool") or (0, 0, 0)
+            dropped = self._db.one("SELECT dropped_bodies FROM spool") or (0,)
         chunks, records, size = map(sum, zip(*held.values(), strict=True))
         return SpoolStatistics(chunks, records, size, held[_BARE][0] + held[_WHOLE][0], held[_ASIDE][0], *dropped)
 

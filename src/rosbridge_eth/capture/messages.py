@@ -58,9 +58,6 @@ class Decoder:
         self.fields: Mapping[str, Fielddefs] = definition.fields
         self.max_raw = _max_raw(definition)
 
-    def __repr__(self) -> str:
-        return f"Decoder({self.wire}, {self.type_name})"
-
     @cached_property
     def typestore(self) -> Typestore:
         """rosbags' type store with this type and what it refers to, and nothing else."""

@@ -17,7 +17,7 @@ import pytest
 from pydantic import ValidationError
 
 from bridge.archive.s3 import BUCKET, S3
-from rosbridge_eth.archive import Archive, Bucket, Folder, open_archive
+from rosbridge_eth.archive import PROBE, Archive, Bucket, Folder, open_archive
 from rosbridge_eth.config.models import ArchiveConfig
 from rosbridge_eth.errors import ConfigError, IdentityError, StoreError
 from smcrypto import sm3
@@ -41,9 +41,6 @@ def test_what_was_put_is_got_as_often_as_one_likes(archive: Archive) -> None:
         assert archive.get(DIGEST, len(BODY)) == BODY
     archive.put(b"\0" * 32, b"x")
     assert archive.get(b"\0" * 32, 1) == b"x"
-    archive.delete(DIGEST)
-    archive.delete(DIGEST)
-    assert archive.get(DIGEST, len(BODY)) is None
 
 
 def test_no_more_is_read_than_is_expected_and_one_byte_that_shows_there_is_more(archive: Archive) -> None:
@@ -52,8 +49,9 @@ def test_no_more_is_read_than_is_expected_and_one_byte_that_shows_there_is_more(
 
 
 def test_a_check_leaves_one_object_and_finds_an_archive_that_forgets(archive: Archive, monkeypatch: Any) -> None:
-    assert archive.check() == archive.check()
-    archive.delete(archive.check())
+    archive.check()
+    archive.check()
+    assert archive.get(sm3.digest(PROBE), len(PROBE)) == PROBE
     monkeypatch.setattr(type(archive), "get", lambda self, digest, length: None)
     with pytest.raises(StoreError, match="does not give back"):
         archive.check()
@@ -74,7 +72,7 @@ def test_a_folder_and_a_bucket_have_the_same_names(s3: S3, tmp_path: Path) -> No
 
 def test_a_folder_that_is_not_there_is_not_made_and_not_empty(tmp_path: Path) -> None:
     archive = Folder(tmp_path / "not mounted")
-    for call in (lambda: archive.put(DIGEST, b"x"), lambda: archive.get(DIGEST, 1), lambda: archive.delete(DIGEST)):
+    for call in (lambda: archive.put(DIGEST, b"x"), lambda: archive.get(DIGEST, 1)):
         with pytest.raises(StoreError, match="mount it"):
             call()
     assert not (tmp_path / "not mounted").exists()

@@ -145,7 +145,6 @@ def test_a_disk_that_the_spool_itself_fills_takes_the_new_at_the_expense_of_the_
     assert len(whole) > 100
     statistics = spool.statistics()
     assert statistics.dropped_bodies == 1500 - len(whole)
-    assert statistics.dropped_headers == 1500 - len(found)
     spool.close()
     spool = open_spool(disk / "spool.sqlite")  # the robot may be started again in this state
     assert all_of(spool) == found
@@ -197,7 +196,7 @@ def test_where_not_even_old_ones_make_room_it_says_so_changes_nothing_and_goes_o
             spool.append(one)
     assert spool.statistics().chunks in (before.chunks, before.chunks + 1)
     kept = spool.last_digest
-    assert spool.statistics()[-3:] == (0, 0, 0)
+    assert spool.statistics().dropped_bodies == 0
     ballast.unlink()
     for one in made[0 if kept != made[0].header.digest else 1 :]:
         spool.append(one)
