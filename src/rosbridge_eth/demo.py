@@ -52,8 +52,8 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>From a top
 <h1>From a topic to the chain and back</h1>
 <p>The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
 <pre>{code}</pre>
-<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain that hold a position"></html>
 """
+PICTURE = '<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain">'
 
 
 @dataclass(slots=True)
@@ -273,7 +273,7 @@ def demo(
     trajectory = outputs.Trajectory()
     for record in result.records:
         trajectory.write(record)
-    trajectory.draw(report / "trajectory.png")
+    picture = PICTURE if trajectory.draw(report / "trajectory.png") else ""
     stages = result.stages
     counts = list(zip(
         ("records captured", "chunks of the robot's log", "lines stored by the server", "records equal to the bag's"),
@@ -295,7 +295,7 @@ def demo(
     passed = "Every record came back, proven and equal to the bag's." if result.passed else "Not all came back."
     page = Console(record=True, file=io.StringIO(), width=140, highlight=False, emoji=False)
     page.print(*map(Text, (f"{passed} The bag is {chosen.name}.", *said)), *tables, sep="\n")
-    page.save_html(str(report / "report.html"), code_format=PAGE)
+    page.save_html(str(report / "report.html"), code_format=PAGE + picture)
     data.print(*tables)
     for line in said:
         talk(line)

@@ -227,8 +227,10 @@ def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings
                        f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
             continue
         if told != robots:
-            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
-                       f'write server = "{robots}" into the robot.toml of who joined with it')
+            nowhere = parse_address(told).host in ANYWHERE
+            found = f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}"
+            mended = f'write server = "{robots}" into the robot.toml of who joined with it'
+            yield (broken if nowhere else note)("bundle", found, mended)
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
