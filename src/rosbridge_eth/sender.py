@@ -34,7 +34,10 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
                 " have it registered again (`register --replace`) and `join` the new bundle in a new folder"
             )
         case Reason.EXPIRED:
-            return "see to this machine's clock; if the certificates have expired, have the robot registered again"
+            return (
+                "see to this machine's clock; if the certificates have expired, have the robot registered again, or the"
+                " server's made anew (`renew`)"
+            )
         case Reason.FULL:
             return "wait, or ask the operator for more `workers` (server.toml)"
         case _:

@@ -271,7 +271,7 @@ class Client:
             agreed = handshake.accept(body, self._trust, server_name=self._server_name, at=self._wall())
         except HandshakeRefused as refused:
             self._counts[refused.drop] += 1
-            self._why = events.HandshakeFailed(f"the server's offer is refused: {refused}")
+            self._why = events.HandshakeFailed(f"the server's offer is refused: {refused}", refused.hint)
             self._bad_offers += 1
             if self._bad_offers >= MAX_BAD_OFFERS:
                 self._fail(now)

@@ -83,7 +83,8 @@ class Message(NamedTuple):
 class HandshakeFailed(NamedTuple):
     """At a client: an attempt to connect came to nothing; another follows. why: a sentence for a person.
 
-    hint: what somebody at the server's address says; not authenticated, so only a hint.
+    hint: what somebody at the server's address says, or EXPIRED of its own certificate; not authenticated, so only a
+    hint.
     """
 
     why: str

@@ -130,7 +130,8 @@ class ClientHandshake:
         try:
             peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
-            raise HandshakeRefused(Drop.CERTIFICATE, str(error)) from error
+            hint = Reason.EXPIRED if isinstance(error, ids.ExpiredCertificate) else None
+            raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
         transcript = self._transcript.copy()
         transcript.update(body[: offsets[5]])
         try:

@@ -142,6 +142,7 @@ def test_a_client_refuses_a_false_server(mode, who):
     steps.client.handle_timer(steps.now + 100)
     [failed] = events(steps.client)
     assert isinstance(failed, HandshakeFailed) and "refused" in failed.why
+    assert failed.hint == (Reason.EXPIRED if who == "expired" else None)
     assert events(server) == []
 
 
