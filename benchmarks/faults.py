@@ -422,10 +422,10 @@ class Flow:
         """A robot of this name, that replays the bag."""
         self.site.join(self.name, home)
         (home / "robot.toml").write_text(
-            f'topics = ["{TOPIC}"]\nserver = "127.0.0.1:{self._port}"\nmonitor = "127.0.0.1:{self.monitor}"\n\n'
+            f'topics = [{{topic = "{TOPIC}", for = "{MESSAGES // 10}s"}}]\n'
+            f'server = "127.0.0.1:{self._port}"\nmonitor = "127.0.0.1:{self.monitor}"\n\n'
             f'[log]\nperiod = "100ms"\n\n[spool]\nmax_size = "1 MiB"\n\n'
             f'[source]\nkind = "bag"\npath = "{sample_bag().resolve()}"\nspeed = {self._pace}\n'
-            f'stop = "{MESSAGES // 10}s"\n'
         )
 
     def event(self, text: str) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from bridge.terminal import Terminal
+from ports import free_port
 from rosbridge_eth.errors import ExitCode
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,9 +33,7 @@ def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, requi
     assert found
     commands = [line.removeprefix("rosbridge-eth ").split() for line in found[1].splitlines()]
     assert [words[0] for words in commands] == ["up", "join", "register", "robot"]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:  # other tests may have the usual port
-        free.bind(("127.0.0.1", 0))
-        door = "{}:{}".format(*free.getsockname())
+    door = f"127.0.0.1:{free_port(socket.SOCK_DGRAM)}"  # other tests may have the usual port
     with Terminal(tmp_path, *commands[0], "--listen", door) as up:
         up.answer("A passphrase for all of it: ", "open sesame")
         up.answer("(again): ", "open sesame")

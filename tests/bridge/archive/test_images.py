@@ -19,12 +19,11 @@ import faults
 from bridge.archive.bags import CAMERA, CLOUD, JPEG, ODOM, bag_of_images
 from bridge.archive.s3 import S3
 from rosbridge_eth import doctor
-from rosbridge_eth.archive import PROBE, Archive, open_archive
+from rosbridge_eth.archive import Archive, open_archive
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import Trust, load_identity
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.reading import ProvenRecord, outputs, read_robot
-from smcrypto import sm3
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 @pytest.fixture(scope="module")
@@ -152,9 +151,8 @@ def test_doctor_tries_the_archive_at_both_ends(site: faults.Site, s3: S3) -> Non
         ("ok", "the archive s3://robots/fleet/a was written and read; one small object stays in it"),
         ("ok", "the archive s3://robots/fleet/a answers"),
     ]
-    assert not [file for file in s3.files() if sm3.digest(PROBE).hex() in file.name]
     s3.kill()
     for each in tried():
         assert each.result == "broken" and each.found.startswith("the archive s3://robots/fleet/a cannot be used")
-        assert each.mend.startswith("see that it is up")
+        assert "see that it is up" in each.found
     s3.start()

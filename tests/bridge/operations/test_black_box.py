@@ -144,7 +144,7 @@ def test_what_there_is_no_memory_for_is_lost_in_the_log_and_in_the_figures(robot
 
 
 def test_a_condition_that_does_not_fit_the_type_stops_the_start(robot: RobotHome, bag: Path):
-    for condition, says in (("/bumper dat == true", "did you mean 'data'"), ("/bumper data == 1", "never holds")):
+    for condition, says in (("/bumper dat == true", "it has: data"), ("/bumper data == 1", "never holds")):
         text = f'{TOPICS}{CRASH}\n[source]\nkind = "bag"\npath = "{bag}"\n'.replace("/bumper data == true", condition)
         with pytest.raises(ConfigError, match=says):
             opened(robot, text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from bridge.reading.world import (
     robot,
 )
 from conftest import unavailable
+from ports import free_port
 from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.identity import Trust
@@ -54,11 +54,8 @@ def verifier(require: Callable[[str], str], tmp_path_factory: pytest.TempPathFac
 @pytest.fixture(scope="module")
 def anvil(require: Callable[[str], str]) -> Iterator[Anvil]:
     require("npx")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     try:
-        chain = Anvil.start(port)
+        chain = Anvil.start(free_port())
     except ChainError as error:
         unavailable(str(error))
     with chain:
