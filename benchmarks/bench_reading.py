@@ -168,6 +168,7 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
     tracemalloc.start()
     read()
     print(f"{tracemalloc.get_traced_memory()[1] / 2**20:8.1f} MiB at most while it reads")
+    tracemalloc.stop()
 
 
 if __name__ == "__main__":
