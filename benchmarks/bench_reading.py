@@ -48,7 +48,7 @@ def sample_lines(fields: Sequence[str] = ()) -> tuple[list[bytes], list[bytes]]:
     source = BagSource(sample_bag(), Selection(["/robot_1/odom"]))
     capture = Capture([TopicRule("/robot_1/odom", fields=tuple(fields))], source_kind="bag")
     captured = [found for raw in source.messages() if (found := capture.process(raw, T0_MS * 10**6, True))]
-    opening = [stream_line("bag", "rosbridge_eth 2.0"), captured[0].definition[1]]  # type: ignore[index]
+    opening = [stream_line("bag", "rosbridge_eth 2.0"), *(one.definition[1] for one in captured[:1] if one.definition)]
     return opening, [one.line for one in captured]
 
 

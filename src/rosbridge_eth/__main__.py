@@ -11,8 +11,8 @@ from types import FrameType
 def main() -> int:
     """Run the command line; without the packages of the extra [bridge], say how to get them."""
     # What was closed before Python came (None): without these, a database would be opened under its number.
-    sys.stdin, sys.stdout = sys.stdin or open(os.devnull), sys.stdout or open(os.devnull)  # noqa: SIM115
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
+    sys.stdin, sys.stdout = sys.stdin or open(os.devnull), sys.stdout or open(os.devnull)  # noqa: SIM115 - to the end
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - of the process
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # a shell's background job ignores it
     if ours:
         signal.signal(signal.SIGINT, _leave)

@@ -157,7 +157,7 @@ def monitor(address: Address | None, runs: bool) -> Findings:
         return
     try:
         if not runs:
-            socket.create_server(address, family=socket.AF_INET6 if ":" in address.host else socket.AF_INET).close()
+            socket.create_server(address, family=address.family).close()
             yield ok("monitor", f"{address} is free")
             return
         with closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection:

@@ -240,9 +240,9 @@ class Web:
 
     def __init__(self, address: Address, expected: Collection[str]) -> None:
         self._expected = expected
-        server = type("_Server6", (_Server,), {"address_family": socket.AF_INET6}) if ":" in address[0] else _Server
+        server = type("_FamilyServer", (_Server,), {"address_family": address.family})
         try:
-            self._http: WSGIServer = make_server(address[0], address[1], self._answer, server, _Handler)
+            self._http: WSGIServer = make_server(*address, self._answer, server, _Handler)
         except OSError as error:
             raise NetworkError(f"TCP {address} cannot be opened: {error.strerror}; correct `monitor`") from error
         self.address = Address(address.host, self._http.server_port)

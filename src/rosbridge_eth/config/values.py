@@ -12,6 +12,7 @@ Each parser takes the value TOML gave and raises ValueError with the rest of a s
 from __future__ import annotations
 
 import re
+import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -81,6 +82,11 @@ class Address(NamedTuple):
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def family(self) -> socket.AddressFamily:
+        """Of a socket that listens there."""
+        return socket.AF_INET6 if ":" in self.host else socket.AF_INET
 
 
 def parse_address(value: Any) -> Address:

@@ -10,7 +10,6 @@ Memory is bounded: so many points of a trajectory, the newest record of so many 
 from __future__ import annotations
 
 import json
-import socket
 import sys
 import threading
 import time
@@ -145,9 +144,8 @@ class Page:
             "view": view, "names": OWN_NAMES | {address.host.lower()}, "room": threading.BoundedSemaphore(MAX_PAGES),
             "files": {path: (files.joinpath(name).read_bytes(), kind) for path, (name, kind) in _FILES.items()},
         })  # fmt: skip
-        family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
         room = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        server = type("_Server", (_Server,), {"address_family": family, "room": room})
+        server = type("_Server", (_Server,), {"address_family": address.family, "room": room})
         try:
             self._http = server(tuple(address), handler)
         except OSError as error:
