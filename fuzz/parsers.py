@@ -24,11 +24,12 @@ if __name__ == "__main__":
 
     # At import, which leaves out the unrolled rounds that are compiled then: to instrument those takes many minutes.
     with atheris.instrument_imports(include=["smcrypto"]):
+        import smcrypto.cfca
         import smcrypto.cms
         import smcrypto.diagnosis
         import smcrypto.pkcs12  # noqa: F401
 
-from smcrypto import SMCryptoError, cms, der, diagnose, pem, pkcs12, sm2, x509
+from smcrypto import SMCryptoError, cfca, cms, der, diagnose, pem, pkcs12, sm2, x509
 from smcrypto.x509 import Certificate, CertificateRevocationList, CertificateSigningRequest, Name
 
 
@@ -57,9 +58,7 @@ def _public_key(data: bytes) -> None:
 
 
 def _name(data: bytes) -> None:
-    reader = der.Reader(data)
-    name = Name.read(reader)
-    reader.finish()
+    name = der.parse(data, Name.read)
     _require(Name(name.rdns).to_der() == data, "name")
     _require(str(name).isprintable(), "name's text")
 
@@ -91,9 +90,9 @@ _CERTIFICATE = x509.self_signed(_KEY, subject={"CN": "fuzz"}, not_before=_AT, no
 
 def _cms(data: bytes) -> None:
     for read in (
-        lambda: cms.verify(data, roots=None, at=_AT),
+        lambda: cms.verify(data, roots=[_CERTIFICATE], at=_AT),
         lambda: cms.decrypt(data, _KEY, _CERTIFICATE),
-        lambda: cms.decrypt_and_verify(data, _KEY, _CERTIFICATE, roots=None, at=_AT),
+        lambda: cms.decrypt_and_verify(data, _KEY, _CERTIFICATE, roots=[_CERTIFICATE], at=_AT),
     ):
         try:
             read()
@@ -123,13 +122,17 @@ def _enveloped_key(data: bytes) -> None:
     _require(sm2.PrivateKey.from_enveloped(key.to_enveloped(_KEY.public_key), _KEY) == key, "enveloped key")
 
 
+def _cfca_key(data: bytes) -> None:
+    cfca.open_key(data, _KEY)
+
+
 def _diagnose(data: bytes) -> None:
     _require("\0" not in str(diagnose(data, key=_KEY, message=b"m")), "diagnosis")
 
 
 READERS: tuple[Callable[[bytes], None], ...] = (
     _der, _pem, _private_key, _public_key, _name, _certificate, _request, _crl, _cms, _pkcs12,
-    _pkcs12_inside, _enveloped_key, _diagnose,
+    _pkcs12_inside, _enveloped_key, _cfca_key, _diagnose,
 )  # fmt: skip
 
 

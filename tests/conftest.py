@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -19,9 +20,19 @@ settings.register_profile("thorough", deadline=None, max_examples=5000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
+QUICK = (
+    "smcrypto/test_contract.py", "smcrypto/test_sm3.py", "smcrypto/sm2", "smcrypto/sm4", "bridge/log", "bridge/config",
+    "bridge/capture", "bridge/test_demo.py",
+)  # fmt: skip
+"""What `-m quick` runs: the standards' vectors, the chunk, capture and the whole path once; no server is needed."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Coverage is asked of the library alone; its tracing would make the bridge's tests take twice the time."""
+    here = Path(__file__).parent
     for item in items:
+        if item.path.relative_to(here).as_posix().startswith(QUICK):
+            item.add_marker(pytest.mark.quick)
         if "bridge" in item.path.parts:
             item.add_marker(pytest.mark.no_cover)
 

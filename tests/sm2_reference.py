@@ -43,8 +43,8 @@ def points(curve: Curve) -> list[Point]:
     return [(x, y) for x in range(p) for y in range(p) if (y * y - x**3 - curve.a * x - curve.b) % p == 0]
 
 
-def _tiny(p: int, a: int, b: int, G: Point, n: int, h: int = 1) -> Curve:
-    return Curve(name=f"tiny, p = {p}, n = {n}, h = {h}", p=p, a=a % p, b=b, n=n, G=G, h=h)
+def _tiny(p: int, a: int, b: int, G: Point, n: int) -> Curve:
+    return Curve(name=f"tiny, p = {p}, n = {n}", p=p, a=a % p, b=b, n=n, G=G)
 
 
 # Orders counted by trying all x, y (test_curve does it again). a = -3 and not; n below p and above it.
@@ -53,8 +53,6 @@ TINY_61 = _tiny(67, 2, 18, (1, 17), 61)
 TINY_79 = _tiny(67, -3, 36, (0, 6), 79)
 TINY_1009 = _tiny(1031, -3, 63, (2, 257), 1009)
 TINY = (TINY_17, TINY_61, TINY_79, TINY_1009)
-# A cofactor that is not 1: 76 = 4 * 19 points.
-COFACTOR_4 = _tiny(67, -3, 17, (2, 32), 19, 4)
 
 _sample = {
     name: int(value, 16) if isinstance(value, str) and name != "name" else value
@@ -67,7 +65,6 @@ SAMPLE = Curve(
     b=_sample["b"],
     n=_sample["n"],
     G=(_sample["gx"], _sample["gy"]),
-    h=_sample["h"],
 )
 CURVES = {"sm2p256v1": SM2P256V1, SAMPLE.name: SAMPLE}
 

@@ -43,7 +43,7 @@ MODULES = [
 PUBLIC = [
     smcrypto, *(importlib.import_module(f"smcrypto.{name}") for name in
                 ("errors", "inputs", "sm3", "kdf", "sm4", "sm2", "x509", "der", "pem", "diagnosis",
-                 "cms", "pkcs12")),
+                 "cms", "ocsp", "pkcs12", "timestamp")),
 ]  # fmt: skip
 
 

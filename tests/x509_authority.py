@@ -25,8 +25,14 @@ class Holder:
         """A certificate for a new key (or `key`), issued by this one."""
         key = options.pop("key", None) or sm2.PrivateKey.generate()
         csr = x509.CertificateSigningRequest.create(key, subject={"CN": name})
-        options = {"not_before": BEGIN, "not_after": END} | options
+        options = {"not_before": BEGIN, "not_after": END, "request_uid": sm2.DEFAULT_UID} | options
         return Holder(key, x509.issue(csr, self.certificate, self.key, **options))
+
+    def forge(self, name: str, **options: Any) -> Holder:
+        """As `issue`, where this certificate may not: issued by one of the same name and key that may."""
+        forever = datetime(9999, 12, 31, tzinfo=UTC)
+        allowed = x509.self_signed(self.key, subject=self.certificate.subject, not_before=BEGIN, not_after=forever)
+        return Holder(self.key, allowed).issue(name, **options)
 
     def ca(self, name: str, **options: Any) -> Holder:
         return self.issue(name, ca=True, **options)
@@ -54,3 +60,19 @@ def root(name: str = "root", **options: Any) -> Holder:
 
 def certificates(*holders: Holder) -> list[x509.Certificate]:
     return [holder.certificate for holder in holders]
+
+
+RSA = der.sequence(der.oid("1.2.840.113549.1.1.1"), der.null())
+SHA256_RSA = der.sequence(der.oid("1.2.840.113549.1.1.11"), der.null())
+
+
+def foreign_der(subject: str = "foreign", key_algorithm: bytes = RSA, issuer: str = "foreign") -> bytes:
+    """A certificate of another algorithm, as far as its form goes; nothing verifies its signature."""
+    # What stands after the key is not looked at: a BOOLEAN of 1 is not DER.
+    odd = der.explicit(3, der.sequence(der.sequence(der.oid("1.2.3"), b"\x01\x01\x01", der.octet_string(b""))))
+    tbs = der.sequence(
+        der.explicit(0, der.integer(2)), der.integer(7), SHA256_RSA, x509.Name.build({"CN": issuer}).to_der(),
+        der.sequence(der.time(BEGIN), der.time(END)), x509.Name.build({"CN": subject}).to_der(),
+        der.sequence(key_algorithm, der.bit_string(b"key")), odd,
+    )  # fmt: skip
+    return der.sequence(tbs, SHA256_RSA, der.bit_string(b"signature"))

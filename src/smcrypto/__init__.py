@@ -3,8 +3,9 @@
 `sm2` signature, key exchange, encryption (GB/T 32918) · `sm3` hash
 (GB/T 32905) · `sm4` block cipher, modes, AEAD (GB/T 32907, 17964) · `kdf` key
 derivation · `x509` certificates · `cms` signed and enveloped messages
-(GB/T 35275) · `pkcs12` files · `diagnose` what somebody gave you. Importing
-the package loads none of them: each arrives with its first use.
+(GB/T 35275) · `pkcs12` files · `tls` connections (TLCP, TLS 1.3) · `cfca`
+requests · `diagnose` what somebody gave you. Importing the package loads none
+of them: each arrives with its first use.
 """
 
 from __future__ import annotations
@@ -32,43 +33,29 @@ from smcrypto.errors import (
 )
 
 if TYPE_CHECKING:
+    from . import cfca as cfca
     from . import cms as cms
     from . import kdf as kdf
+    from . import ocsp as ocsp
     from . import pkcs12 as pkcs12
     from . import sm2 as sm2
     from . import sm3 as sm3
     from . import sm4 as sm4
+    from . import timestamp as timestamp
+    from . import tls as tls
     from . import x509 as x509
     from .diagnosis import diagnose as diagnose
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "AlreadyFinalized",
-    "CertificateError",
-    "ConfirmationError",
-    "InvalidCiphertext",
-    "InvalidEncoding",
-    "InvalidKey",
-    "InvalidLength",
-    "InvalidOption",
-    "InvalidPadding",
-    "InvalidSignature",
-    "InvalidTag",
-    "MissingDependency",
-    "OutOfOrder",
-    "SMCryptoError",
-    "cms",
-    "diagnose",
-    "kdf",
-    "pkcs12",
-    "sm2",
-    "sm3",
-    "sm4",
-    "x509",
-]
+    "AlreadyFinalized", "CertificateError", "ConfirmationError", "InvalidCiphertext", "InvalidEncoding", "InvalidKey",
+    "InvalidLength", "InvalidOption", "InvalidPadding", "InvalidSignature", "InvalidTag", "MissingDependency",
+    "OutOfOrder", "SMCryptoError", "cfca", "cms", "diagnose", "kdf", "ocsp", "pkcs12", "sm2", "sm3", "sm4", "timestamp",
+    "tls", "x509",
+]  # fmt: skip
 
-_MODULES = frozenset({"cms", "kdf", "pkcs12", "sm2", "sm3", "sm4", "x509"})
+_MODULES = frozenset({"cfca", "cms", "kdf", "ocsp", "pkcs12", "sm2", "sm3", "sm4", "timestamp", "tls", "x509"})
 
 
 def __getattr__(name: str) -> ModuleType | Callable[..., object]:

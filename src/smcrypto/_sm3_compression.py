@@ -3,8 +3,7 @@
 Names are the standard's: V, B, W, W' (here X), A ... H, SS1, SS2, TT1, TT2, T_j, FF_j, GG_j,
 P_0, P_1. A state V is a tuple of eight 32-bit integers, a block sixteen.
 
-Two forms stand side by side. `expand_by_definition` and `compress_by_definition` transcribe the standard
-and are the tests' oracle. `expand_one`, `expand_many` and `compress` are what runs:
+As the standard writes them they are the tests' oracle (tests/sm3_reference.py). Here they are faster:
 
 * Rotations work on *repeated* words: x·(2^32 + 1) holds x twice, so one right shift puts any rotation of
   x in the low 32 bits. Sums, XORs and ANDs do not mind what lies above bit 31, so that words are masked
@@ -23,8 +22,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias
 
-__all__ = ["IV", "MANY", "compress", "compress_by_definition", "compress_bytes", "expand_by_definition",
-           "expand_many", "expand_one"]
+__all__ = ["IV", "MANY", "compress", "compress_bytes", "expand_many", "expand_one"]
 
 State: TypeAlias = tuple[int, ...]
 # The 132 words W_0 ... W_67, W'_0 ... W'_63 of one block.
@@ -39,46 +37,10 @@ _TOGETHER = 256  # blocks expanded at once at most: bounds memory, and keeps the
 _M = 0xFFFFFFFF
 
 
-def _rotl(x: int, n: int) -> int:
-    n %= 32
-    return (x << n | x >> (32 - n)) & _M
-
-
 def _T(j: int) -> int:
     """The round constant of 4.2, rotated by j as 5.3.3 uses it."""
-    return _rotl(0x79CC4519 if j < 16 else 0x7A879D8A, j)
+    return (0x79CC4519 if j < 16 else 0x7A879D8A) * _TWICE >> 32 - j % 32 & _M
 
-
-# --- the standard, transcribed ------------------------------------------------------------------------------
-
-
-def expand_by_definition(B: tuple[int, ...]) -> Expanded:
-    """5.3.2: W_0 ... W_67 and W'_0 ... W'_63 of the block B of sixteen words."""
-    W = list(B)
-    for j in range(16, 68):
-        x = W[j - 16] ^ W[j - 9] ^ _rotl(W[j - 3], 15)
-        P_1 = x ^ _rotl(x, 15) ^ _rotl(x, 23)
-        W.append(P_1 ^ _rotl(W[j - 13], 7) ^ W[j - 6])
-    return (*W, *(W[j] ^ W[j + 4] for j in range(64)))
-
-
-def compress_by_definition(V: State, expanded: Expanded) -> State:
-    """5.3.3: CF(V, B) for an expanded block."""
-    W, X = expanded[:68], expanded[68:]
-    A, B, C, D, E, F, G, H = V
-    for j in range(64):
-        SS1 = _rotl((_rotl(A, 12) + E + _T(j)) & _M, 7)
-        SS2 = SS1 ^ _rotl(A, 12)
-        FF = A ^ B ^ C if j < 16 else (A & B) | (A & C) | (B & C)
-        GG = E ^ F ^ G if j < 16 else (E & F) | (~E & G)
-        TT1 = (FF + D + SS2 + X[j]) & _M
-        TT2 = (GG + H + SS1 + W[j]) & _M
-        D, C, B, A = C, _rotl(B, 9), A, TT1
-        H, G, F, E = G, _rotl(F, 19), E, TT2 ^ _rotl(TT2, 9) ^ _rotl(TT2, 17)
-    return tuple(v ^ w for v, w in zip(V, (A, B, C, D, E, F, G, H), strict=True))
-
-
-# --- the same, unrolled -------------------------------------------------------------------------------------
 
 _TWICE = (1 << 32) + 1  # x * _TWICE is x repeated: rotl(x, n) are the low 32 bits of x * _TWICE >> 32 - n
 _THRICE = (1 << 64) + (1 << 32) + 1
@@ -98,23 +60,11 @@ _COMPRESS = """\
 def compress(V, blocks):
     a, b, c, d, e, f, g, h = V
     for {words} in blocks:
-        A = a * TWICE
-        B = b * TWICE
-        C = c
-        D = d
-        E = e * TWICE
-        F = f * TWICE
-        G = g
-        H = h
+        A = a * TWICE; B = b * TWICE; C = c; D = d
+        E = e * TWICE; F = f * TWICE; G = g; H = h
 {rounds}\
-        a ^= A & M
-        b ^= B & M
-        c ^= C & M
-        d ^= D & M
-        e ^= E & M
-        f ^= F & M
-        g ^= G & M
-        h ^= H & M
+        a ^= A & M; b ^= B & M; c ^= C & M; d ^= D & M
+        e ^= E & M; f ^= F & M; g ^= G & M; h ^= H & M
     return a, b, c, d, e, f, g, h
 """
 

@@ -8,16 +8,20 @@ BER: definite lengths in the fewest bytes (10.1), integers in the fewest bytes
 
 Not here: tag numbers above 30, REAL and EMBEDDED PDV, which none of our
 structures use; they are refused. What a structure means is its parser's
-business; a parser ends with `finish()`, which refuses what is left over.
+business. No parser has to ask whether something is left over: `reading` and
+`reading_sequence` do at the end of their block, and a reader does for every
+value inside it before it goes on behind that value.
 Every refusal is InvalidEncoding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Container, Iterable, Iterator
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from functools import lru_cache
-from typing import Final
+from typing import Final, TypeVar
 
 from smcrypto.errors import InvalidEncoding
 from smcrypto.inputs import BytesLike, as_bytes
@@ -25,9 +29,9 @@ from smcrypto.inputs import BytesLike, as_bytes
 __all__ = [
     "BIT_STRING", "BMP_STRING", "BOOLEAN", "ENUMERATED", "GENERALIZED_TIME", "IA5_STRING", "INTEGER", "NULL",
     "NUMERIC_STRING", "OCTET_STRING", "OID", "PRINTABLE_STRING", "SEQUENCE", "SET", "T61_STRING",
-    "UNIVERSAL_STRING", "UTC_TIME", "UTF8_STRING", "VISIBLE_STRING", "Reader", "bit_string", "boolean", "check",
-    "element", "enumerated", "explicit", "generalized_time", "implicit", "integer", "named_bits", "null",
-    "octet_string", "oid", "only_sequence", "sequence", "set_of", "time", "utf8_string",
+    "UNIVERSAL_STRING", "UTC_TIME", "UTF8_STRING", "VISIBLE_STRING", "Reader", "algorithm", "bit_string", "boolean",
+    "check", "element", "enumerated", "explicit", "generalized_time", "implicit", "integer", "named_bits", "null",
+    "octet_string", "oid", "parse", "reading", "reading_sequence", "sequence", "set_of", "time", "utf8_string",
 ]  # fmt: skip
 
 # Identifier octets, X.690 8.1.2 and X.680 table 1; SEQUENCE and SET with the constructed bit (0x20).
@@ -55,38 +59,46 @@ _CONSTRUCTED: Final = 0x20
 _CONTEXT: Final = 0x80  # context-specific class, 8.1.2.2
 # A certificate nests about ten deep; this bounds what hostile input can make a reader of readers do.
 _MAX_DEPTH: Final = 32
-# Universal tags that DER encodes in primitive form only (8.2 to 8.8, 8.19, 10.2).
-_PRIMITIVE_ONLY: Final = frozenset(
-    {BOOLEAN, INTEGER, BIT_STRING, OCTET_STRING, NULL, OID, ENUMERATED, UTF8_STRING, NUMERIC_STRING,
-     PRINTABLE_STRING, T61_STRING, IA5_STRING, UTC_TIME, GENERALIZED_TIME, VISIBLE_STRING, UNIVERSAL_STRING,
-     BMP_STRING}
-)  # fmt: skip
+# The tags above, each in the one form that DER has: primitive but for the last two (8.2 to 8.11, 8.19, 10.2).
+_UNIVERSAL: Final = frozenset(globals()[name] for name in __all__ if name.isupper())
 # Bounds in bytes of content, far above what our structures hold (20, 33 and 2): what is longer is hostile, and
 # costs more than its size once it is printed in decimal or spread into a set.
 _MAX_OID: Final = 64
 _MAX_INTEGER: Final = 256
 _MAX_NAMED_BITS: Final = 16
 
+# 8.19.4: below the roots 0 and 1 stand arcs of up to 39. 39 digits hold the longest arcs in use, UUIDs (X.667).
+_DOTTED: Final = re.compile(r"([01]\.[1-3]?[0-9]|2\.ARC)(\.ARC)*".replace("ARC", "(0|[1-9][0-9]{0,38})"))
+
+_T = TypeVar("_T")
+
 
 class Reader:
     """Reads one run of DER values front to back, never outside it.
 
     A method that expects another type than the one that stands next raises
-    InvalidEncoding, as does anything that is not DER.
+    InvalidEncoding, as does anything that is not DER. A reader of what is inside a
+    value is read to its end before the one that it came from goes on: what is left
+    then is refused.
     """
 
-    __slots__ = ("_data", "_depth", "_end", "_pos")
+    __slots__ = ("_data", "_depth", "_end", "_inside", "_pos")
 
-    def __init__(self, data: BytesLike) -> None:
-        self._data = as_bytes(data, "data")
-        self._pos = 0
-        self._end = len(self._data)
-        self._depth = 0
+    def __init__(self, data: bytes, start: int, end: int, depth: int) -> None:
+        """For this module: a reader comes from `reading`, which sees to its end, or from another reader."""
+        self._data = data
+        self._pos = start
+        self._end = end
+        self._depth = depth
+        self._inside: Reader | None = None  # the reader of the last value, until what follows that is read
 
     # --- the one place where lengths are read ---
 
     def _content(self, tag: int) -> tuple[int, int]:
         """Step over the value that stands next, which must have `tag`; (start, end) of its content."""
+        if self._inside is not None:
+            self._inside._complete()
+            self._inside = None
         data, pos, limit = self._data, self._pos, self._end
         if pos + 2 > limit:
             raise InvalidEncoding(f"expected tag {tag:#04x} at byte {pos}, found the end")
@@ -109,15 +121,17 @@ class Reader:
         self._pos = end
         return start, end
 
-    def _inner(self, tag: int) -> Reader:
+    def _inner(self, tag: int, *, ordered: bool = False) -> Reader:
+        """A reader of what is inside; `ordered`: its values must stand in ascending order of their encodings."""
         start, end = self._content(tag)
         if self._depth >= _MAX_DEPTH:
             raise InvalidEncoding(f"more than {_MAX_DEPTH} levels deep")
-        inner = Reader.__new__(Reader)
-        inner._data = self._data
-        inner._pos = start
-        inner._end = end
-        inner._depth = self._depth + 1
+        inner = self._inside = Reader(self._data, start, end, self._depth + 1)
+        if ordered:
+            values = inner.each(Reader.raw)
+            if values != sorted(values):
+                raise InvalidEncoding(f"set at byte {start} is not in ascending order")
+            inner._pos = start
         return inner
 
     # --- position ---
@@ -130,8 +144,10 @@ class Reader:
         """Is nothing left?"""
         return self._pos >= self._end
 
-    def finish(self) -> None:
-        """InvalidEncoding if anything is left."""
+    def _complete(self) -> None:
+        """InvalidEncoding if anything is left, here or in the value read last: called by what handed the reader out."""
+        if self._inside is not None:
+            self._inside._complete()
         if self._pos != self._end:
             raise InvalidEncoding(f"{self._end - self._pos} bytes left over at byte {self._pos}")
 
@@ -145,13 +161,19 @@ class Reader:
     def raw(self) -> bytes:
         """The next value whole, identifier and length included; what is inside it is not looked at."""
         begin = self._pos
-        if begin >= self._end:
-            raise InvalidEncoding(f"expected a value at byte {begin}, found the end")
-        tag = self._data[begin]
-        if tag & 0x1F == 0x1F or tag == 0:
-            raise InvalidEncoding(f"tag {tag:#04x} at byte {begin} is not used here")
-        _, end = self._content(tag)
-        return self._data[begin:end]
+        self._content(self._tag(range(1, 0x40)))
+        return self._data[begin : self._pos]
+
+    def each(self, read: Callable[[Reader], _T]) -> list[_T]:
+        """What `read` makes of this reader again and again, until nothing is left."""
+        found = []
+        while not self.at_end():
+            found.append(read(self))
+        return found
+
+    def rest(self) -> list[bytes]:
+        """All values that are left, each as `checked` gives it."""
+        return self.each(Reader.checked)
 
     def checked(self) -> bytes:
         """As `raw`, and everything inside is DER as well, as far as its tags tell (`check`)."""
@@ -168,36 +190,31 @@ class Reader:
 
     def integer(self, *, signed: bool = False) -> int:
         """A whole number in the fewest bytes (8.3.2); a negative one only with `signed`."""
-        start, end = self._content(INTEGER)
-        return self._number(start, end, signed)
+        return self._number(INTEGER, signed)
 
     def enumerated(self) -> int:
         """An ENUMERATED, not negative, in the fewest bytes (8.4)."""
-        start, end = self._content(ENUMERATED)
-        return self._number(start, end, False)
+        return self._number(ENUMERATED, False)
 
     def implicit_integer(self, number: int) -> int:
-        """A non-negative INTEGER under the implicit tag [number]."""
-        start, end = self._content(_CONTEXT | number)
-        return self._number(start, end, False)
+        """An INTEGER under the implicit tag [number], possibly negative."""
+        return self._number(_CONTEXT | number, True)
 
-    def _number(self, start: int, end: int, signed: bool) -> int:
-        data = self._data
-        if not 1 <= end - start <= _MAX_INTEGER:
+    def _number(self, tag: int, signed: bool) -> int:
+        start, end = self._content(tag)
+        octets = self._data[start:end]
+        if not 1 <= len(octets) <= _MAX_INTEGER:
             raise InvalidEncoding(f"integer at byte {start} is empty, or longer than {_MAX_INTEGER} bytes")
-        first = data[start]
-        if end - start > 1 and (
-            (first == 0x00 and data[start + 1] < 0x80) or (first == 0xFF and data[start + 1] >= 0x80)
-        ):
+        number = int.from_bytes(octets, "big", signed=True)
+        if _magnitude(number) != octets:
             raise InvalidEncoding(f"integer at byte {start} is not in the fewest bytes")
-        if first >= 0x80 and not signed:
+        if number < 0 and not signed:
             raise InvalidEncoding(f"integer at byte {start} is negative")
-        return int.from_bytes(data[start:end], "big", signed=True)
+        return number
 
     def octet_string(self) -> bytes:
         """An OCTET STRING in one piece (10.2)."""
-        start, end = self._content(OCTET_STRING)
-        return self._data[start:end]
+        return self.value(OCTET_STRING)
 
     def bit_string(self) -> bytes:
         """A bit string of whole bytes."""
@@ -207,8 +224,20 @@ class Reader:
         return self._data[start + 1 : end]
 
     def named_bits(self) -> frozenset[int]:
-        """The numbers of the bits that are set in a NamedBitList; trailing zero bits are refused (11.2.2)."""
-        return _bits(self.value(BIT_STRING))
+        """The numbers of the bits that are set in a NamedBitList; zero bits at its end (11.2.2) say nothing."""
+        body = self._bits()
+        if len(body) > _MAX_NAMED_BITS:
+            raise InvalidEncoding(f"named bits are longer than {_MAX_NAMED_BITS} bytes")
+        return frozenset(8 * i + j for i, byte in enumerate(body) for j in range(8) if byte & (0x80 >> j))
+
+    def _bits(self) -> bytes:
+        """The bytes of a bit string; the unused bits of the last one must be zero (11.2.1)."""
+        content = self.value(BIT_STRING)
+        if not content or content[0] > 7 or (content[0] and len(content) == 1):
+            raise InvalidEncoding("bit string has an impossible number of unused bits")
+        if content[-1] & ((1 << content[0]) - 1):
+            raise InvalidEncoding("bit string has unused bits that are not zero")
+        return content[1:]
 
     def null(self) -> None:
         """A NULL, which is empty (8.8)."""
@@ -218,8 +247,17 @@ class Reader:
 
     def oid(self) -> str:
         """An object identifier in dotted form."""
-        start, end = self._content(OID)
-        return _dotted(self._data[start:end])
+        return _dotted(self.value(OID))
+
+    def algorithm(self, known: Container[str], what: str) -> str:
+        """The name in an AlgorithmIdentifier (RFC 5280, 4.1.1.2), one of `known`; its parameters: NULL or nothing."""
+        inner = self.sequence()
+        name = inner.oid()
+        if name not in known:
+            raise InvalidEncoding(f"the {what} is by {name}, which is not supported")
+        if not inner.at_end():
+            inner.null()
+        return name
 
     def sequence(self) -> Reader:
         """A reader of what is inside a SEQUENCE."""
@@ -227,9 +265,7 @@ class Reader:
 
     def set_of(self) -> Reader:
         """The elements of a SET OF, which must stand in ascending order of their encodings (11.6)."""
-        inner = self._inner(SET)
-        inner._require_order()
-        return inner
+        return self._inner(SET, ordered=True)
 
     def set_in_any_order(self) -> Reader:
         """The elements of a SET OF where a standard asks for BER only (RFC 2315): their order is not looked at."""
@@ -237,9 +273,7 @@ class Reader:
 
     def implicit_set_of(self, number: int) -> Reader:
         """As `set_of`, under the implicit tag [number]."""
-        inner = self._inner(_CONTEXT | _CONSTRUCTED | number)
-        inner._require_order()
-        return inner
+        return self._inner(_CONTEXT | _CONSTRUCTED | number, ordered=True)
 
     def explicit(self, number: int) -> Reader:
         """What is inside the constructed tag [number]: an EXPLICIT value, or an IMPLICIT sequence."""
@@ -258,86 +292,69 @@ class Reader:
         return self.peek_tag() == _CONTEXT | number
 
     def time(self) -> datetime:
-        """A Time of RFC 5280, 4.1.2.5: UTCTime for 1950-2049, else GeneralizedTime; UTC, whole seconds."""
+        """A Time of RFC 5280, 4.1.2.5: UTCTime or GeneralizedTime, whichever the year; UTC, whole seconds."""
         tag = UTC_TIME if self.peek_tag() == UTC_TIME else GENERALIZED_TIME
-        moment = _parse_time(tag, self.value(tag))
-        if tag == GENERALIZED_TIME and 1950 <= moment.year <= 2049:
-            raise InvalidEncoding("a date through 2049 must be a UTCTime (RFC 5280, 4.1.2.5)")
-        return moment
+        return _parse_time(tag, self.value(tag))
 
-    # --- order and walk ---
+    def generalized_time(self, *, fraction: bool = False) -> datetime:
+        """A GeneralizedTime in UTC and whole seconds (11.7; RFC 5280, 4.1.2.5.2), or with a fraction (11.7.3)."""
+        whole, point, digits = self.value(GENERALIZED_TIME).partition(b"." if fraction else b"Z")
+        if not fraction or not point:
+            return _parse_time(GENERALIZED_TIME, whole + point + digits)
+        if not digits[:-1].isdigit() or digits[-2:-1] == b"0" or digits[-1:] != b"Z":
+            raise InvalidEncoding("time has a fraction that is not of the form .s*Z without zeros at the end")
+        moment = _parse_time(GENERALIZED_TIME, whole + b"Z")
+        return moment.replace(microsecond=int(digits[:-1][:6].ljust(6, b"0")))
 
-    def _require_order(self) -> None:
-        begin, previous = self._pos, b""
-        while self._pos < self._end:
-            current = self.raw()
-            if current < previous:
-                raise InvalidEncoding(f"set at byte {begin} is not in ascending order")
-            previous = current
-        self._pos = begin
+    # --- walk ---
 
-    def _walk(self) -> None:
+    def _tag(self, known: Container[int]) -> int:
+        """The identifier octet that stands next, one of `known` if below 0x40: universal, or of an application."""
         tag = self.peek_tag()
         if tag is None:
             raise InvalidEncoding(f"expected a value at byte {self._pos}, found the end")
-        strange = tag < 0x40 and tag & _CONSTRUCTED and tag not in (SEQUENCE, SET)
-        if tag & 0x1F == 0x1F or tag == 0 or strange:
+        if tag & 0x1F == 0x1F or (tag < 0x40 and tag not in known):
             raise InvalidEncoding(f"tag {tag:#04x} at byte {self._pos} is not used here")
+        return tag
+
+    def _walk(self) -> None:
+        tag = self._tag(_UNIVERSAL)
         if tag & _CONSTRUCTED:
-            inner = self._inner(tag)
-            if tag == SET:
-                inner._require_order()
-            while inner._pos < inner._end:
+            inner = self._inner(tag, ordered=tag == SET)
+            while not inner.at_end():
                 inner._walk()
-        elif tag == BOOLEAN:
-            self.boolean()
         elif tag in (INTEGER, ENUMERATED):
-            start, end = self._content(tag)
-            self._number(start, end, True)
-        elif tag == BIT_STRING:
-            _split_bits(self.value(BIT_STRING))
-        elif tag == NULL:
-            self.null()
-        elif tag == OID:
-            self.oid()
-        elif tag < 0x40 and tag not in _PRIMITIVE_ONLY:
-            raise InvalidEncoding(f"tag {tag:#04x} at byte {self._pos} is not used here")
+            self._number(tag, True)
         else:
-            self._content(tag)
+            table = {BOOLEAN: Reader.boolean, NULL: Reader.null, OID: Reader.oid, BIT_STRING: Reader._bits}
+            table.get(tag, Reader.raw)(self)
+
+
+@contextmanager
+def reading(data: BytesLike) -> Iterator[Reader]:
+    """`with reading(data) as reader:` hands out a reader of `data`, all of which is to be read in the block."""
+    octets = as_bytes(data, "data")
+    reader = Reader(octets, 0, len(octets), 0)
+    yield reader
+    reader._complete()
+
+
+@contextmanager
+def reading_sequence(data: BytesLike) -> Iterator[Reader]:
+    """As `reading`, of what is inside the one SEQUENCE that `data` is."""
+    with reading(data) as outer:
+        yield outer.sequence()
+
+
+def parse(data: BytesLike, read: Callable[[Reader], _T]) -> _T:
+    """What `read` makes of a reader of `data`: `parse(data, Reader.integer)` is the one INTEGER that `data` is."""
+    with reading(data) as reader:
+        return read(reader)
 
 
 def check(data: BytesLike) -> bytes:
     """`data` again, if it is exactly one DER value and everything inside it is DER; else InvalidEncoding."""
-    reader = Reader(data)
-    value = reader.checked()
-    reader.finish()
-    return value
-
-
-def only_sequence(data: BytesLike) -> Reader:
-    """A reader of what is inside the one SEQUENCE that `data` is; InvalidEncoding if anything follows it."""
-    outer = Reader(data)
-    inner = outer.sequence()
-    outer.finish()
-    return inner
-
-
-def _split_bits(content: bytes) -> tuple[int, bytes]:
-    """(unused bits, bytes) of a bit string; the unused bits must be zero (11.2.1)."""
-    if not content or content[0] > 7 or (content[0] and len(content) == 1):
-        raise InvalidEncoding("bit string has an impossible number of unused bits")
-    if content[-1] & ((1 << content[0]) - 1) and len(content) > 1:
-        raise InvalidEncoding("bit string has unused bits that are not zero")
-    return content[0], content[1:]
-
-
-def _bits(content: bytes) -> frozenset[int]:
-    unused, body = _split_bits(content)
-    if len(body) > _MAX_NAMED_BITS:
-        raise InvalidEncoding(f"named bits are longer than {_MAX_NAMED_BITS} bytes")
-    if body and not body[-1] & (1 << unused):
-        raise InvalidEncoding("named bits end in zero bits (X.690, 11.2.2)")
-    return frozenset(8 * i + j for i, byte in enumerate(body) for j in range(8) if byte & (0x80 >> j))
+    return parse(data, Reader.checked)
 
 
 @lru_cache(maxsize=512)
@@ -420,9 +437,7 @@ def bit_string(content: bytes) -> bytes:
 def named_bits(bits: Iterable[int]) -> bytes:
     """A NamedBitList with these bits set, without trailing zero bits (11.2.2)."""
     wanted = set(bits)
-    if not wanted:
-        return element(BIT_STRING, b"\x00")
-    top = max(wanted)
+    top = max(wanted, default=-1)
     unused = 7 - top % 8
     number = sum(1 << (top - bit) for bit in wanted) << unused
     return element(BIT_STRING, bytes((unused,)) + number.to_bytes(top // 8 + 1, "big"))
@@ -436,14 +451,9 @@ def null() -> bytes:
 @lru_cache(maxsize=512)
 def oid(dotted: str) -> bytes:
     """The object identifier written as `1.2.156.10197`; InvalidEncoding if that is not one."""
-    parts = dotted.split(".")
-    if len(parts) < 2 or not all(part.isascii() and part.isdigit() and len(part) < 40 for part in parts):
+    if not _DOTTED.fullmatch(dotted):
         raise InvalidEncoding(f"not an object identifier: {dotted!r}")
-    if any(part[0] == "0" and part != "0" for part in parts):
-        raise InvalidEncoding(f"not an object identifier: {dotted!r}")
-    first, second, *rest = map(int, parts)
-    if first > 2 or (first < 2 and second > 39):
-        raise InvalidEncoding(f"not an object identifier: {dotted!r}")
+    first, second, *rest = map(int, dotted.split("."))
     content = bytearray()
     for arc in (40 * first + second, *rest):
         groups = [arc & 0x7F]
@@ -453,6 +463,11 @@ def oid(dotted: str) -> bytes:
     if len(content) > _MAX_OID:
         raise InvalidEncoding(f"object identifier longer than {_MAX_OID} bytes")
     return element(OID, bytes(content))
+
+
+def algorithm(dotted: str) -> bytes:
+    """An AlgorithmIdentifier (RFC 5280, 4.1.1.2) with NULL for its parameters."""
+    return sequence(oid(dotted), null())
 
 
 def sequence(*parts: bytes) -> bytes:

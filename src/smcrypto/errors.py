@@ -9,21 +9,13 @@ a malformed ciphertext and a tampered one are not told apart.
 from __future__ import annotations
 
 __all__ = [
-    "AlreadyFinalized",
-    "CertificateError",
-    "ConfirmationError",
-    "InvalidCiphertext",
-    "InvalidEncoding",
-    "InvalidKey",
-    "InvalidLength",
-    "InvalidOption",
-    "InvalidPadding",
-    "InvalidSignature",
-    "InvalidTag",
-    "MissingDependency",
-    "OutOfOrder",
-    "SMCryptoError",
-]
+    "AlreadyFinalized", "CertificateAlgorithmError", "CertificateError", "CertificateExpiredError",
+    "CertificateHostnameError", "CertificateMalformedError", "CertificateNotYetValidError",
+    "CertificateRevokedError", "CertificateSignatureError", "CertificateUnknownIssuerError",
+    "CertificateUsageError", "ConfirmationError", "InvalidCiphertext", "InvalidEncoding", "InvalidKey",
+    "InvalidLength", "InvalidOption", "InvalidPadding", "InvalidSignature", "InvalidTag", "MissingDependency",
+    "OutOfOrder", "SMCryptoError",
+]  # fmt: skip
 
 
 class SMCryptoError(Exception):
@@ -68,6 +60,42 @@ class ConfirmationError(SMCryptoError, ValueError):
 
 class CertificateError(SMCryptoError, ValueError):
     """A certificate, request or revocation list is malformed, or is not to be trusted; the text says why."""
+
+
+class CertificateMalformedError(CertificateError):
+    """A field of a certificate, request or revocation list is not well formed, or, to a strict judge, odd."""
+
+
+class CertificateAlgorithmError(CertificateError):
+    """A certificate has a key, or a signature, of another algorithm than SM2; the text names it."""
+
+
+class CertificateExpiredError(CertificateError):
+    """The moment lies after a certificate's last second."""
+
+
+class CertificateNotYetValidError(CertificateError):
+    """The moment lies before a certificate's first second."""
+
+
+class CertificateUnknownIssuerError(CertificateError):
+    """No path leads to a trusted root: a certificate's issuer is not among those given, or the root is not trusted."""
+
+
+class CertificateUsageError(CertificateError):
+    """A certificate's basic constraints, key usage or extended key usage do not allow what it is used for."""
+
+
+class CertificateHostnameError(CertificateError):
+    """A certificate is not for this host name or IP address."""
+
+
+class CertificateSignatureError(CertificateError, InvalidSignature):
+    """The signature of a certificate, request or revocation list does not hold."""
+
+
+class CertificateRevokedError(CertificateError):
+    """A revocation list of its issuer names the certificate."""
 
 
 class AlreadyFinalized(SMCryptoError):

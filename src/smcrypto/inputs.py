@@ -1,20 +1,23 @@
-"""What every public function does first: take any bytes-like object, refuse all that is of another type."""
+"""What every public function does first: take any bytes-like object, refuse all that is of another type.
+
+And what all objects that hold a secret key have in common.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from smcrypto.errors import InvalidLength
 
 if TYPE_CHECKING:
     # collections.abc.Buffer exists from Python 3.12 only; type checkers know it by this name in every version.
-    from typing_extensions import Buffer
+    from typing_extensions import Buffer, Self
 
     BytesLike: TypeAlias = Buffer
 else:
     BytesLike = bytes | bytearray | memoryview
 
-__all__ = ["BytesLike", "as_bytes", "as_exact_bytes", "require_int", "require_type"]
+__all__ = ["BytesLike", "KeyHolder", "as_bytes", "as_exact_bytes", "require_int", "require_type"]
 
 
 def as_bytes(value: BytesLike, name: str) -> bytes:
@@ -46,3 +49,18 @@ def require_type(value: object, kind: type, name: str) -> None:
     """TypeError, naming the argument, unless `value` is a `kind`."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a {kind.__name__}, not {type(value).__name__}")
+
+
+class KeyHolder:
+    """An immutable object with a secret key: its copy is itself, and it is not pickled."""
+
+    __slots__ = ()
+
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(f"a {type(self).__name__} is not pickled: that would write its key")

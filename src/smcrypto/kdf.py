@@ -53,13 +53,9 @@ def hkdf(key: BytesLike, length: int, *, salt: BytesLike = b"", info: BytesLike 
     if not 0 <= require_int(length, "length") <= _HKDF_LIMIT:
         raise InvalidLength(f"length must be 0 ... {_HKDF_LIMIT} bytes, not {length}")
     PRK = sm3.hmac(salt, IKM)
-    keyed_inner, keyed_outer = sm3._keyed(PRK)
     T, output = b"", []
     for i in range(1, (length + _HASH - 1) // _HASH + 1):
-        inner, outer = keyed_inner.copy(), keyed_outer.copy()
-        inner.update(T + info + bytes([i]))
-        outer.update(inner.digest())
-        T = outer.digest()
+        T = sm3.hmac(PRK, T + info + bytes([i]))
         output.append(T)
     return b"".join(output)[:length]
 

@@ -13,19 +13,23 @@ from __future__ import annotations
 import binascii
 import codecs
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from smcrypto.errors import InvalidEncoding
 from smcrypto.inputs import BytesLike, as_bytes
 
-__all__ = ["Block", "decode", "encode", "first"]
+__all__ = ["Block", "EncryptedBlock", "armoured", "decode", "encode", "first", "unarmoured"]
 
 _BOUNDARY: Final = re.compile(rb"-----(BEGIN|END) ([ -~]+)-----[ \t]*")
 # RFC 7468, 3: of the printable characters, "-" and the space stand only singly and between others. (One expression for
 # both would remember every place where a long line could be cut.)
 _NO_LABEL: Final = re.compile(rb"^[ -]|[ -]{2}|[ -]$")
 _LINE_END: Final = re.compile(rb"\r\n|\n|\r")
+
+
+class EncryptedBlock(InvalidEncoding):
+    """A PEM block with the headers of RFC 1421."""
 
 
 class Block(NamedTuple):
@@ -48,8 +52,12 @@ def decode(data: BytesLike, labels: Iterable[str] | None = None) -> list[Block]:
 
     labels: only blocks with one of them; what is inside the others is not looked at.
     """
+    return [Block(label, unarmoured(lines)) for label, lines in armoured(data, labels)]
+
+
+def armoured(data: BytesLike, labels: Iterable[str] | None = None) -> Iterator[tuple[str, list[bytes]]]:
+    """As `decode`, with the lines between the boundaries as they stand there, for `unarmoured`."""
     wanted = None if labels is None else tuple(labels)
-    blocks: list[Block] = []
     label: bytes | None = None
     body: list[bytes] = []
     for line in _LINE_END.split(as_bytes(data, "data").removeprefix(codecs.BOM_UTF8)):
@@ -63,13 +71,12 @@ def decode(data: BytesLike, labels: Iterable[str] | None = None) -> list[Block]:
             body.append(line.strip(b" \t"))
         elif match[1] == b"END" and match[2] == label:
             if wanted is None or label.decode("ascii") in wanted:
-                blocks.append(Block(label.decode("ascii"), _unarmoured(body)))
+                yield label.decode("ascii"), body
             label = None
         else:
             raise InvalidEncoding("a PEM block does not end with the END line of its label")
     if label is not None:
         raise InvalidEncoding("a PEM block has no END line")
-    return blocks
 
 
 def first(data: BytesLike, labels: Iterable[str]) -> Block:
@@ -80,9 +87,10 @@ def first(data: BytesLike, labels: Iterable[str]) -> Block:
     raise InvalidEncoding(f"no PEM block labelled {' or '.join(wanted)}")
 
 
-def _unarmoured(lines: list[bytes]) -> bytes:
+def unarmoured(lines: list[bytes]) -> bytes:
+    """The DER that `lines` are the base64 of; InvalidEncoding, of headers EncryptedBlock."""
     if any(b":" in line for line in lines):
-        raise InvalidEncoding("the PEM block has RFC 1421 headers; such encryption is not supported")
+        raise EncryptedBlock("the PEM block has RFC 1421 headers; such encryption is not supported")
     text = b"".join(lines)
     try:
         der = binascii.a2b_base64(text)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import hmac as _hmac
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 from smcrypto.inputs import BytesLike, as_bytes
@@ -30,29 +31,19 @@ class _Hash(Protocol):
     def copy(self) -> Self: ...
 
 
-def _openssl() -> _Hash | None:
-    """hashlib's hash object for the empty message, or None where there is none.
+def _choose(pure: bool) -> tuple[str, _Hash]:
+    """(name, hash object of the empty message) of the engine to use.
 
-    It is made rather than looked up: `hashlib.algorithms_available` names what the linked OpenSSL knows, not
+    hashlib's is made rather than looked up: `hashlib.algorithms_available` names what the linked OpenSSL knows, not
     what its configuration lets a program use. `usedforsecurity=False` would get round such a configuration,
     and is not ours to say.
     """
-    try:
-        return hashlib.new("sm3")
-    except ValueError:
-        return None
-
-
-def _python() -> _Hash:
+    if not pure:
+        with suppress(ValueError):
+            return "openssl", hashlib.new("sm3")
     from smcrypto._sm3_python import PythonSM3
 
-    return PythonSM3()
-
-
-def _choose(pure: bool) -> tuple[str, _Hash]:
-    """(name, hash object of the empty message) of the engine to use."""
-    openssl = None if pure else _openssl()
-    return ("python", _python()) if openssl is None else ("openssl", openssl)
+    return "python", PythonSM3()
 
 
 #: "openssl" or "python": what computes SM3 in this process.
@@ -105,8 +96,7 @@ class SM3:
         other._state = self._state.copy()
         return other
 
-    def __copy__(self) -> SM3:
-        return self.copy()
+    __copy__ = copy
 
     def __deepcopy__(self, memo: object) -> SM3:
         return self.copy()

@@ -50,8 +50,7 @@ for v in tests("sm2_encrypt"):
         n += 1
 key = sm2.PrivateKey.generate()
 for prf in ("sm3", "sha256"):
-    point = key.public_key.to_bytes()
-    pem = keyfiles.dump_private(key.to_int(), point, b"pw", "pkcs8", form="pem", prf=prf, iterations=2000)
+    pem = keyfiles.dump_private(key, b"pw", "pkcs8", form="pem", prf=prf, iterations=2000)
     assert sm2.PrivateKey.from_pem(pem, b"pw") == key
 
 at = datetime(2026, 6, 1, tzinfo=UTC)

@@ -41,7 +41,7 @@ def report() -> dict[str, Any]:
         "datetime": "2026-01-31T12:00:00+00:00",
         "machine_info": {
             "cpu": {"brand_raw": "A processor"}, "machine": "x86_64", "python_implementation": "CPython",
-            "python_version": "3.11.7", "sm3_engine": "openssl",
+            "python_version": "3.11.7", "engines": "SM2 by python, SM3 by openssl, SM4 by python",
         },
         "benchmarks": [
             entry("SM4-CTR 1 MiB", "gmssl", 3.4, 1 << 20),
@@ -71,8 +71,8 @@ def test_ratios_are_how_many_times_as_fast_we_are(report: dict[str, Any]) -> Non
 
 def test_the_table_names_machine_engine_rate_and_every_peer(report: dict[str, Any]) -> None:
     assert bench.markdown(report).splitlines() == [
-        "Measured 2026-01-31 on A processor, CPython 3.11.7, SM3 engine: openssl. Medians; every ratio is from this "
-        "one run.",
+        "Measured 2026-01-31 on A processor, CPython 3.11.7, SM2 by python, SM3 by openssl, SM4 by python. Medians; "
+        "every ratio is from this one run.",
         "",
         "| what | smcrypto | rate | beside | ratio |",
         "| --- | ---: | ---: | --- | ---: |",
@@ -84,9 +84,9 @@ def test_the_table_names_machine_engine_rate_and_every_peer(report: dict[str, An
 
 
 def test_a_machine_without_a_brand_is_named_by_its_kind(report: dict[str, Any]) -> None:
-    report["machine_info"] |= {"cpu": {}, "sm3_engine": None}
-    del report["machine_info"]["sm3_engine"]
-    assert "on x86_64, " in bench.markdown(report) and "SM3 engine: unknown" in bench.markdown(report)
+    report["machine_info"] |= {"cpu": {}, "engines": None}
+    del report["machine_info"]["engines"]
+    assert "on x86_64, " in bench.markdown(report) and "engines unknown" in bench.markdown(report)
 
 
 @pytest.mark.parametrize("seconds, text", [

@@ -15,6 +15,7 @@ import pytest
 
 from smcrypto import der, pem, sm2, x509
 from smcrypto.cli import main
+from x509_authority import NOW, foreign_der
 
 UTC = timezone.utc
 
@@ -128,7 +129,7 @@ def test_issue_verifies_the_request(fleet: Path, capsys: pytest.CaptureFixture[s
 
 def test_issue_hands_out_nothing_that_would_be_refused(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ("issue", "--dir", "fleet", *PASSWORD, "-o", "out", "robot.csr")
-    assert "give fewer --days" in refusal(capsys, *common, "--days", "4000")
+    assert "when the CA's certificate ends" in refusal(capsys, *common, "--days", "4000")
     issue("--intermediate", "--path-length", "0", output="sub.crt")
     Path("sub").mkdir()
     Path("sub/ca.crt.pem").write_bytes(Path("sub.crt").read_bytes())
@@ -140,6 +141,37 @@ def test_issue_hands_out_nothing_that_would_be_refused(fleet: Path, capsys: pyte
     issue(output="sub/ca.crt.pem")
     assert "is not a CA" in refusal(capsys, *sub, "--days", "9")
     assert not Path("out").exists()
+
+
+def test_without_days_a_certificate_ends_with_the_ca_at_the_latest(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run("init", "--dir", "short", "--subject", "CN=Short", "--days", "9", "--unencrypted")
+    assert main(["keygen", "-o", "own.key"]) == 0
+    run("csr", "--key", "own.key", "--subject", "CN=robot", "-o", "robot.csr")
+    run("issue", "--dir", "short", "-o", "robot.crt", "robot.csr")
+    assert certificate("robot.crt").not_after == certificate("short/ca.crt.pem").not_after
+    run("issue", "--dir", "short", "-o", "robot.crt", "--days", "8", "robot.csr")
+    assert certificate("robot.crt").not_after < certificate("short/ca.crt.pem").not_after
+    refusal(capsys, "issue", "--dir", "short", "--days", "365", "robot.csr")
+    refusal(capsys, "issue", "--dir", "short", "--days", "0", "robot.csr")
+    key = sm2.PrivateKey.from_pem(Path("short/ca.key.pem").read_bytes())
+    past = datetime.now(UTC) - timedelta(days=1)
+    expired = x509.self_signed(key, subject="CN=Short", not_before=past, not_after=past)
+    Path("short/ca.crt.pem").write_bytes(expired.to_pem())
+    assert "when the CA's certificate ends" in refusal(capsys, "issue", "--dir", "short", "robot.csr")
+
+
+def test_show_names_what_is_foreign_or_odd(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    foreign, odd = foreign_der("other"), x509.self_signed(
+        sm2.PrivateKey.generate(), subject="CN=odd", not_before=NOW, not_after=NOW,
+        extensions=[x509.Extension("2.5.29.32", True, b"\x30\x00")],
+    )  # fmt: skip
+    Path("bundle").write_bytes(pem.encode("CERTIFICATE", foreign) + odd.to_pem())
+    run("show", "bundle")
+    shown = capsys.readouterr().out
+    assert "subject:              CN=other" in shown and "key:                  RSA" in shown
+    assert "odd:                  certificatePolicies is critical" in shown
 
 
 def test_another_distinguishing_id(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:

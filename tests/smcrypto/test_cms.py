@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
+import subprocess
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -15,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import smcrypto
+from der_variants import opened, unchecked
 from smcrypto import (
     CertificateError,
     InvalidCiphertext,
@@ -56,6 +59,18 @@ FREE = issued(OTHER, key_usage=())
 TRUST: dict[str, Any] = {"roots": [ROOT], "at": NOW}
 
 
+def test_a_negative_serial_number_names_its_certificate() -> None:
+    """As in `Certificate.oddities`: CMS names certificates by issuer and serial number."""
+    with der.reading_sequence(FREE.tbs_certificate) as body:
+        fields = [body.raw() for _ in range(8)]
+    tbs = der.sequence(fields[0], der.integer(-5), *fields[2:])
+    algorithm = der.sequence(der.oid("1.2.156.10197.1.501"))
+    signed = der.sequence(tbs, algorithm, der.bit_string(ROOT_KEY.sign(tbs)))
+    odd = x509.Certificate.from_der(signed)
+    assert odd.serial_number == -5
+    assert cms.verify(cms.sign(CONTENT, OTHER, odd), **TRUST).signers == (odd,)
+
+
 # --- what another implementation wrote ---
 
 
@@ -75,6 +90,20 @@ def test_enveloped_messages_of_the_peer() -> None:
     assert sm2.PrivateKey.from_enveloped(PEER.enveloped_key, KEY).to_bytes() == PEER.enveloped_key_d
 
 
+def test_messages_of_cfca() -> None:
+    """SADK names recipients by their keys (SHA-1 of it, where the certificate has no identifier), and SM4 by itself."""
+    sadk = json.loads((Path(__file__).parents[1] / "vectors/peers/cms_cfca/messages.json").read_text("utf-8"))
+    content = sadk["signed_content"].encode()
+    for name, outside in (("signed", None), ("signed_detached", content)):
+        data = base64.b64decode(sadk[name])
+        signer = x509.Certificate.from_der(unchecked(parts(data)[3]).explicit(0).raw())
+        assert cms.verify(data, roots=[signer], at=signer.not_before, content=outside)[:2] == (content, (signer,))
+    for one in sadk["enveloped"]:
+        key = sm2.PrivateKey.from_bytes(bytes.fromhex(one["key"]))
+        certificate = x509.Certificate.from_der(base64.b64decode(one["certificate"]))
+        assert cms.decrypt(base64.b64decode(one["message"]), key, certificate) == sadk["enveloped_content"].encode()
+
+
 # --- our own ---
 
 
@@ -89,15 +118,15 @@ def test_signed(content: bytes, detached: bool, time: datetime | None, uid: byte
     data = cms.sign(content, key, certificate, detached=detached, signing_time=time, uid=uid)
     assert der.check(data) == data
     given_content = content if detached else None
-    found = cms.verify(data, roots=None, at=NOW, content=given_content, uid=uid)
+    found = cms.verify(data, roots=[certificate], at=NOW, content=given_content, uid=uid)
     assert found == (content, (certificate,), (time,))
     armoured = pem.encode("PKCS7", data)
-    assert cms.verify(armoured, roots=None, at=NOW, content=given_content, uid=uid) == found
+    assert cms.verify(armoured, roots=[certificate], at=NOW, content=given_content, uid=uid) == found
     with pytest.raises(InvalidSignature):
-        cms.verify(data, roots=None, at=NOW, content=given_content, uid=b"another")
+        cms.verify(data, roots=[certificate], at=NOW, content=given_content, uid=b"another")
     if detached:
         with pytest.raises(InvalidSignature):
-            cms.verify(data, roots=None, at=NOW, content=content + b"!", uid=uid)
+            cms.verify(data, roots=[certificate], at=NOW, content=content + b"!", uid=uid)
 
 
 def test_a_message_may_have_pem_in_its_content() -> None:
@@ -109,7 +138,7 @@ def test_a_message_may_have_pem_in_its_content() -> None:
 
 def without_attributes(data: bytes) -> bytes:
     """The message whose signature `data` has: no attributes, and their DER as the content."""
-    info = der.only_sequence(data)
+    info = opened(data)
     kind, body = info.raw(), info.explicit(0).sequence()
     version, digests, _, certificates = (body.raw() for _ in range(4))
     signer = body.set_of().sequence()
@@ -133,10 +162,20 @@ def test_attributes_are_not_taken_for_a_content() -> None:
         assert cms.verify(cms.sign(other, OTHER, SIGNING), **TRUST).content == other
 
 
+@pytest.mark.parametrize("value", [
+    bytes.fromhex("010101"), bytes.fromhex("3106020102020101"), bytes.fromhex("1b0161"), bytes.fromhex("5f810001"),
+], ids=["a boolean of BER", "a set out of order", "a GeneralString", "a long tag"])  # fmt: skip
+def test_nor_are_attributes_that_this_library_would_not_read(value: bytes) -> None:
+    """Another library signed them: the message itself is refused here, but its signature holds over their DER."""
+    message = signed_with([TYPE, DIGEST, der.sequence(der.oid("1.2.3"), der.element(der.SET, value))])
+    with pytest.raises(InvalidSignature, match="attributes of another message"):
+        cms.verify(without_attributes(message), **TRUST)
+
+
 def test_a_changed_content_is_told_in_one_way_only() -> None:
     """Bad padding or a bad signature: the difference would be an oracle for the content (Vaudenay, 2002)."""
     data = cms.sign_and_encrypt(b"a content of more than one block", OTHER, SIGNING, [SEALING])
-    info = der.only_sequence(data)
+    info = opened(data)
     info.oid()
     body = info.explicit(0).sequence()
     encrypted = [body.raw() for _ in range(4)][3]
@@ -158,8 +197,11 @@ def test_a_signer_must_be_trusted() -> None:
         cms.verify(data, roots=[CERTIFICATE], at=NOW)
     with pytest.raises(CertificateError):
         cms.verify(data, roots=[ROOT], at=NOW + timedelta(100))
-    with pytest.raises(CertificateError, match="may not sign"):
-        cms.verify(cms.sign(CONTENT, OTHER, SEALING), **TRUST)
+    info = unchecked(parts(data)[-1]).set_of().sequence().rest()
+    named = der.sequence(SEALING.issuer.to_der(), der.integer(SEALING.serial_number))
+    members = [*parts(data)[:3], der.explicit(0, SEALING.to_der()), der.set_of(der.sequence(info[0], named, *info[2:]))]
+    with pytest.raises(x509.CertificateUsageError, match="may not sign"):
+        cms.verify(message(2, members), **TRUST)
     assert cms.verify(cms.sign(CONTENT, OTHER, FREE), **TRUST)
     revoked = x509.CertificateRevocationList.create(
         ROOT, ROOT_KEY, revoked=[x509.RevokedCertificate(SIGNING.serial_number, NOW)], this_update=NOW,
@@ -236,7 +278,7 @@ def test_what_cannot_be_written() -> None:
 
 def parts(data: bytes) -> list[bytes]:
     """The members of the body of a message."""
-    outer = der.Reader(data).sequence()
+    outer = unchecked(data).sequence()
     outer.oid()
     body = outer.explicit(0).sequence()
     members = []
@@ -290,12 +332,12 @@ def test_attributes_are_required_and_compared() -> None:
 
 def test_other_algorithms_and_versions_are_refused() -> None:
     sha256 = der.sequence(der.oid("2.16.840.1.101.3.4.2.1"))
-    for options in ({"digest": sha256}, {"signature": sha256}, {"version": 3},
+    for options in ({"digest": sha256}, {"signature": sha256}, {"version": 4},
                     {"signature": der.sequence(der.oid("1.2.156.10197.1.501"), der.integer(1))}):  # fmt: skip
         with pytest.raises(InvalidEncoding):
             cms.verify(signed_with([TYPE, DIGEST], **options), **TRUST)  # type: ignore[arg-type]
     members = parts(cms.encrypt(b"m", [FREE]))
-    info = der.Reader(members[2]).sequence()
+    info = unchecked(members[2]).sequence()
     name, cipher, text = info.raw(), info.raw(), info.raw()
     for altered in (
         [name, der.sequence(der.oid("1.2.156.10197.1.104.1")), text],
@@ -330,17 +372,42 @@ def test_what_is_missing_or_twice() -> None:
             cms.verify(cut, **TRUST)
 
 
-def test_one_failure_for_key_and_padding() -> None:
+def with_key(sealed_key: bytes) -> bytes:
+    """An envelope for FREE whose encrypted content key is this."""
     members = parts(cms.encrypt(b"m", [FREE]))
-    for sealed_key in (CERTIFICATE.public_key.encrypt(bytes(16)), OTHER.public_key.encrypt(bytes(16)),
-                       OTHER.public_key.encrypt(bytes(15)), b""):  # fmt: skip
-        recipient = der.sequence(
-            der.integer(0), der.sequence(FREE.issuer.to_der(), der.integer(FREE.serial_number)),
-            der.sequence(der.oid("1.2.156.10197.1.301.3")), der.octet_string(sealed_key))  # fmt: skip
-        altered = message(3, [members[0], der.element(der.SET, recipient + recipient), members[2]])
-        with pytest.raises(InvalidCiphertext, match="does not open") as raised:
-            cms.decrypt(altered, OTHER, FREE)
-        assert raised.value.__cause__ is None and raised.value.__suppress_context__
+    recipient = der.sequence(
+        der.integer(0), der.sequence(FREE.issuer.to_der(), der.integer(FREE.serial_number)),
+        der.sequence(der.oid("1.2.156.10197.1.301.3")), der.octet_string(sealed_key))  # fmt: skip
+    return message(3, [members[0], der.element(der.SET, recipient + recipient), members[2]])
+
+
+def test_content_keys_that_do_not_open() -> None:
+    for sealed_key in (CERTIFICATE.public_key.encrypt(bytes(16)), OTHER.public_key.encrypt(bytes(15)),
+                       OTHER.public_key.encrypt(bytes(32)), b"", b"0", b"\4"):  # fmt: skip
+        with pytest.raises(InvalidCiphertext):
+            cms.decrypt(with_key(sealed_key), OTHER, FREE)
+    assert len(cms.decrypt(with_key(OTHER.public_key.encrypt(bytes(16))), OTHER, FREE)) <= 16  # of another key
+    raw = OTHER.public_key.encrypt(bytes(16), encoding="c1c2c3")
+    for sealed_key in (raw, raw[1:]):  # without 04: CFCA's software before version 3.2
+        assert len(cms.decrypt(with_key(sealed_key), OTHER, FREE)) <= 16
+
+
+def test_no_alteration_of_an_envelope_tells_the_content() -> None:
+    """The attack of Vaudenay (2002): an error for some of the 256 values of a byte would tell the byte after it."""
+    content = b"a secret of 35 bytes, which is here"
+    data = cms.encrypt(content, [FREE])
+    altered = bytearray(data)
+    lengths = set()
+    for value in range(256):
+        altered[-17] = data[-17] ^ value
+        lengths.add(len(cms.decrypt(altered, OTHER, FREE)))
+    assert 48 in lengths  # padding that is not well formed stays
+    for cut in (1, 48):
+        members = parts(data)
+        name, cipher, text = unchecked(members[2]).sequence().rest()
+        shorter = der.sequence(name, cipher, der.implicit(0, unchecked(text).implicit(0)[cut:]))
+        with pytest.raises(InvalidCiphertext, match="whole number"):
+            cms.decrypt(message(3, [*members[:2], shorter]), OTHER, FREE)
 
 
 SAMPLES = [cms.sign(b"m", OTHER, SIGNING, signing_time=NOW), cms.encrypt(b"m", [FREE]),
@@ -399,9 +466,192 @@ def test_what_is_no_sealed_key(altered: dict[str, bytes]) -> None:
 
 
 def test_the_algorithm_of_an_enveloped_key_has_nothing_after_its_parameters() -> None:
-    members = der.only_sequence(OTHER.to_enveloped(KEY.public_key))
+    members = opened(OTHER.to_enveloped(KEY.public_key))
     algorithm, rest = members.raw(), [members.raw() for _ in range(3)]
     assert sm2.PrivateKey.from_enveloped(der.sequence(algorithm, *rest), KEY) == OTHER
     longer = der.sequence(algorithm[2:] + der.null())
     with pytest.raises(InvalidKey, match="left over"):
         sm2.PrivateKey.from_enveloped(der.sequence(longer, *rest), KEY)
+
+
+# --- BER, identifiers, neighbours of other algorithms, wrong use ---
+
+
+def foreign(certificate: x509.Certificate) -> bytes:
+    """The same certificate with the curve P-256 for its key; nothing verifies its signature."""
+    return certificate.to_der().replace(der.oid("1.2.156.10197.1.301"), der.oid("1.2.840.10045.3.1.7"))
+
+
+def with_indefinite_lengths(data: bytes, levels: int = 4) -> bytes:
+    """`data` as streaming writers write it: the frame in indefinite lengths, a string in pieces of five bytes."""
+    reader = unchecked(data)
+    tag = data[0]
+    if not tag & 0x20:
+        content = reader.value(tag)
+        if tag not in (der.OCTET_STRING, 0x80) or levels > 2:
+            return data
+        pieces = [der.octet_string(content[i : i + 5]) for i in range(0, len(content), 5)]
+        return bytes((tag | 0x20, 0x80)) + b"".join(pieces) + b"\0\0"
+    if levels == 0 and tag == der.SEQUENCE:
+        return data
+    inner = reader._inner(tag)
+    parts = []
+    while not inner.at_end():
+        parts.append(with_indefinite_lengths(inner.raw(), levels - 1))
+    return bytes((tag, 0x80)) + b"".join(parts) + b"\0\0"
+
+
+@pytest.mark.parametrize("time", [None, NOW])
+def test_messages_in_ber(time: datetime | None) -> None:
+    signed = with_indefinite_lengths(cms.sign(CONTENT, OTHER, SIGNING, signing_time=time))
+    assert cms.verify(signed, **TRUST) == (CONTENT, (SIGNING,), (time,))
+    assert cms.verify(pem.encode("PKCS7", signed), **TRUST).content == CONTENT
+    assert cms.decrypt(with_indefinite_lengths(cms.encrypt(CONTENT, [SEALING])), OTHER, SEALING) == CONTENT
+    both = with_indefinite_lengths(cms.sign_and_encrypt(CONTENT, OTHER, SIGNING, [SEALING]))
+    assert cms.decrypt_and_verify(both, OTHER, SEALING, **TRUST).content == CONTENT
+
+
+def test_certificates_in_a_message_are_der() -> None:
+    """A certificate is compared and hashed by the bytes received: it is not written again."""
+    members = parts(cms.sign(CONTENT, OTHER, SIGNING))
+    inside = opened(SIGNING.to_der()).rest()
+    members[3] = der.explicit(0, b"\x30\x80" + b"".join(inside) + b"\0\0")
+    with pytest.raises(InvalidEncoding, match="definite length"):
+        cms.verify(message(2, members), **TRUST)
+
+
+def test_certificates_of_other_algorithms_do_no_harm() -> None:
+    beside = x509.ForeignCertificate.from_der(foreign(CERTIFICATE))
+    data = cms.sign(CONTENT, OTHER, SIGNING, certificates=[beside])
+    assert beside.to_der() in data
+    assert cms.verify(data, roots=[ROOT, beside], at=NOW, intermediates=[beside]).signers == (SIGNING,)
+    both = cms.sign_and_encrypt(CONTENT, OTHER, SIGNING, [SEALING], certificates=[beside])
+    assert cms.decrypt_and_verify(both, OTHER, SEALING, **TRUST).signers == (SIGNING,)
+    members = parts(cms.sign(CONTENT, OTHER, SIGNING))
+    members[3] = der.explicit(0, foreign(SIGNING))
+    with pytest.raises(x509.CertificateAlgorithmError, match="EC P-256, not SM2"):
+        cms.verify(message(2, members), **TRUST)
+    members[3] = der.explicit(0, der.sequence(der.integer(1)))
+    with pytest.raises(CertificateError, match="not a valid"):
+        cms.verify(message(2, members), **TRUST)
+
+
+def test_recipients_of_other_kinds_are_passed_over() -> None:
+    members = parts(cms.encrypt(CONTENT, [FREE]))
+    ours = unchecked(members[1]).set_of().raw()
+    rsa = der.sequence(
+        der.integer(0), der.sequence(ROOT.subject.to_der(), der.integer(1)),
+        der.sequence(der.oid("1.2.840.113549.1.1.1"), der.null()), der.octet_string(bytes(256)))  # fmt: skip
+    agreement = der.explicit(1, der.integer(3))  # KeyAgreeRecipientInfo, RFC 5652, 6.2.2
+    for order in ([ours, rsa, agreement], [agreement, rsa, ours]):
+        data = message(3, [members[0], der.element(der.SET, b"".join(order)), members[2], der.explicit(1, SM3)])
+        assert cms.decrypt(data, OTHER, FREE) == CONTENT
+    with pytest.raises(CertificateError, match="not for"):
+        cms.decrypt(message(3, [members[0], der.set_of(rsa, agreement), members[2]]), OTHER, FREE)
+    with pytest.raises(InvalidEncoding, match="key encryption"):  # for us, but by RSA
+        named = der.sequence(FREE.issuer.to_der(), der.integer(FREE.serial_number))
+        wrong = der.sequence(der.integer(0), named, *opened(rsa).rest()[2:])
+        cms.decrypt(message(3, [members[0], der.set_of(wrong), members[2]]), OTHER, FREE)
+
+
+@pytest.mark.parametrize("identifiers", ["gm", "rfc"])
+def test_recipients_and_signers_are_named_by_their_keys_too(identifiers: Any) -> None:
+    """As CFCA's software names them: RecipientInfo of version 2 with the SubjectKeyIdentifier."""
+    if identifiers == "rfc":
+        pytest.importorskip("cryptography")
+    assert SEALING.subject_key_identifier is not None
+    data = cms.encrypt(CONTENT, [CERTIFICATE, SEALING], identifiers=identifiers, named_by="key")
+    assert der.implicit(0, SEALING.subject_key_identifier) in data and SEALING.issuer.to_der() not in data
+    assert cms.decrypt(data, OTHER, SEALING) == CONTENT
+    with pytest.raises(CertificateError, match="not for"):
+        cms.decrypt(data, ROOT_KEY, ROOT)
+    info = unchecked(parts(cms.sign(CONTENT, OTHER, SIGNING))[-1]).set_of().sequence().rest()
+    for identifier, trusted in ((SIGNING.subject_key_identifier, True), (bytes(20), False)):
+        assert identifier is not None
+        named = der.sequence(der.integer(3), der.implicit(0, identifier), *info[2:])
+        members = [der.integer(3), *parts(cms.sign(CONTENT, OTHER, SIGNING))[1:-1], der.set_of(named)]
+        if trusted:
+            assert cms.verify(message(2, members), **TRUST).signers == (SIGNING,)
+        else:
+            with pytest.raises(CertificateError, match=f"not here: key {bytes(20).hex()}"):
+                cms.verify(message(2, members), **TRUST)
+
+
+def test_identifiers_of_rfc() -> None:
+    """RFC 5652's content types, and SM2-with-SM3 as the algorithm of the signature."""
+    data = cms.sign(CONTENT, OTHER, SIGNING, signing_time=NOW, identifiers="rfc")
+    assert opened(data).oid() == "1.2.840.113549.1.7.2"
+    assert data.count(der.oid("1.2.840.113549.1.7.1")) == 2  # of the content, and in the attributes
+    assert b"".join(map(der.oid, ("1.2.156.10197.1.501",))) in parts(data)[-1]
+    assert cms.verify(data, **TRUST) == (CONTENT, (SIGNING,), (NOW,))
+    gm = cms.sign(CONTENT, OTHER, SIGNING, signing_time=NOW)
+    assert opened(gm).oid() == "1.2.156.10197.6.1.4.2.2" and der.oid("1.2.840.113549.1.7.1") not in gm
+    wrong: Any = "cfca"
+    with pytest.raises(InvalidOption, match="identifiers"):
+        cms.sign(CONTENT, OTHER, SIGNING, identifiers=wrong)
+    with pytest.raises(InvalidOption, match="identifiers"):
+        cms.encrypt(CONTENT, [SEALING], identifiers=wrong)
+    with pytest.raises(InvalidOption, match="named_by"):
+        cms.encrypt(CONTENT, [SEALING], named_by=wrong)
+    anonymous = x509.Certificate.from_der(SEALING.to_der().replace(der.oid("2.5.29.14"), der.oid("2.5.29.99")))
+    assert cms.decrypt(cms.encrypt(CONTENT, [anonymous], named_by="key"), OTHER, anonymous) == CONTENT
+
+
+@pytest.mark.parametrize("identifiers, named_by, version", [
+    ("gm", "issuer", 1), ("gm", "key", 2), ("rfc", "issuer", 0), ("rfc", "key", 2),
+])  # fmt: skip
+def test_versions_of_envelopes(identifiers: Any, named_by: Any, version: int) -> None:
+    """GM/T 0010, 9; RFC 5652, 6.1 and 6.2.1: of the envelope, and of the recipient in it."""
+    if identifiers == "rfc":
+        pytest.importorskip("cryptography")
+    body = parts(cms.encrypt(CONTENT, [SEALING], identifiers=identifiers, named_by=named_by))
+    assert body[0] == der.integer(version) == unchecked(body[1]).set_of().sequence().raw()
+
+
+def test_nobody_signs_with_a_certificate_that_verification_refuses() -> None:
+    critical = x509.Certificate.from_der(SIGNING.to_der().replace(der.oid("2.5.29.15"), der.oid("2.5.29.99")))
+    for certificate, time, error in (
+        (SEALING, None, x509.CertificateUsageError),
+        (issued(OTHER, ca=True), None, x509.CertificateUsageError),
+        (critical, None, CertificateError),
+        (SIGNING, NOW + timedelta(99), x509.CertificateExpiredError),
+        (SIGNING, NOW - timedelta(99), x509.CertificateNotYetValidError),
+    ):
+        with pytest.raises(error):
+            cms.sign(CONTENT, OTHER, certificate, signing_time=time)
+    with pytest.raises(x509.CertificateUsageError):
+        cms.sign_and_encrypt(CONTENT, OTHER, SEALING, [SEALING])
+
+
+def test_nothing_is_verified_without_roots() -> None:
+    """What has no trusted signer does not come back as a verified message."""
+    nobody: Any = None
+    data = cms.sign(CONTENT, OTHER, SIGNING)
+    with pytest.raises(TypeError):
+        cms.verify(data, roots=nobody, at=NOW)
+    with pytest.raises(CertificateError):
+        cms.verify(data, roots=[], at=NOW)
+    with pytest.raises(TypeError):
+        cms.decrypt_and_verify(cms.sign_and_encrypt(CONTENT, OTHER, SIGNING, [FREE]), OTHER, FREE, roots=nobody, at=NOW)
+
+
+@pytest.mark.parametrize("uid, time, verified", [
+    (b"", NOW, True), (sm2.DEFAULT_UID, NOW, False),
+    (b"", None, False),  # without attributes it verifies SM3 of the content, without the Z of GB/T 32918.2
+])  # fmt: skip
+def test_openssl_verifies_what_is_signed_for_it(
+    uid: bytes, time: datetime | None, verified: bool, tmp_path: Path, require: Callable[[str], str]
+) -> None:
+    """OpenSSL 3.0 takes an empty uid for signatures of messages, and knows the identifiers of RFC 5652 only."""
+    data = cms.sign(b"pay 10", OTHER, SIGNING, signing_time=time, identifiers="rfc", uid=uid)
+    (tmp_path / "message").write_bytes(data)
+    # -noverify: its check of the certificate itself wants its purpose for S/MIME
+    done = subprocess.run([require("openssl"), "cms", "-verify", "-inform", "DER", "-in", tmp_path / "message",
+                           "-noverify", "-binary"], capture_output=True, check=False)  # fmt: skip
+    assert (done.returncode == 0) == verified, done.stderr
+    assert not verified or done.stdout == b"pay 10"
+
+
+@given(st.sampled_from(SAMPLES[:3]).map(with_indefinite_lengths), st.data())
+def test_altered_messages_in_ber_are_refused_or_say_the_same(sample: bytes, draw: st.DataObject) -> None:
+    test_altered_messages_are_refused_or_say_the_same.hypothesis.inner_test(sample, draw)  # type: ignore[attr-defined]

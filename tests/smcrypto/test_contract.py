@@ -185,7 +185,7 @@ def test_key_exchange() -> None:
     key_a, confirmation_a = a.agree(b.ephemeral, 48)
     key_b, confirmation_b = b.agree(a.ephemeral, 48)
     assert key_a == key_b and len(key_a) == 48 and confirmation_a != confirmation_b
-    assert a.confirm(confirmation_b) is None
+    assert a.confirm(confirmation_b) == key_a
     with pytest.raises(smcrypto.ConfirmationError):
         b.confirm(confirmation_b)
     with pytest.raises(smcrypto.OutOfOrder):
@@ -595,12 +595,21 @@ def test_no_secret_shows_where_objects_are_printed() -> None:
     assert str(secret.to_int()) not in shown
 
 
-def test_a_private_key_is_not_pickled_and_cannot_be_changed() -> None:
-    with pytest.raises(TypeError, match="pickle"):
-        pickle.dumps(key)
+def test_a_key_cannot_be_changed() -> None:
     for thing in (key, public):
         with pytest.raises(AttributeError):
             thing.curve = None  # type: ignore[misc, assignment]
+
+
+@pytest.mark.parametrize("holder", [
+    key, sm4.SM4(KEY16), sm4.SM4GCM(KEY16), sm4.SM4CCM(KEY16), sm4.Cipher(KEY16, sm4.CBC(IV)),
+    sm2.KeyExchange(key, b"", public, b"", initiator=True).agree(public.to_bytes(), 16)[0],
+], ids=lambda holder: type(holder).__name__)  # fmt: skip
+def test_no_object_writes_its_key_into_a_pickle(holder: Any) -> None:
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        with pytest.raises(TypeError, match="is not pickled"):
+            pickle.dumps([holder], protocol)
+    assert copy.copy(holder) is holder and copy.deepcopy([holder])[0] is holder
 
 
 def test_public_values_can_be_pickled() -> None:

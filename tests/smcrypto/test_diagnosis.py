@@ -1,10 +1,9 @@
-"""`diagnose`: every form of every thing is recognised, what fits is said, and the calls that it prints do read it."""
+"""`diagnose`: every form of every thing is recognised, what fits is said, and the call that it prints does read it."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
-import importlib.util
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 import smcrypto
 from smcrypto import InvalidKey, InvalidLength, diagnose, sm2, sm3, x509
 from smcrypto.cli import main
-from smcrypto.diagnosis import MAX_SIZE, key_of
+from smcrypto.diagnosis import MAX_SIZE, Reading, key_of
 from smcrypto.sm2.curve import SM2P256V1
 from x509_authority import root
 
@@ -36,17 +35,9 @@ WRITTEN = {
 }
 
 
-def evaluated(call: str, data: Any, **names: Any) -> Any:
+def evaluated(reading: Reading, **names: Any) -> Any:
     """The Python that a diagnosis prints, run."""
-    return eval(call.partition("   #")[0], {"sm2": sm2, "x509": x509, "base64": base64, "data": data, **names})
-
-
-def gmssl_names() -> dict[str, Any]:
-    if importlib.util.find_spec("gmssl") is None:
-        pytest.skip("the package gmssl is not installed")
-    from gmssl.sm2 import CryptSM2
-
-    return {"CryptSM2": CryptSM2, "D": D, "XY": XY}
+    return eval(reading.call.partition("   #")[0], {"sm2": sm2, "x509": x509, "octets": reading.octets, **names})
 
 
 @pytest.mark.parametrize("written", WRITTEN)
@@ -57,9 +48,9 @@ def test_private_keys(form: str, written: str) -> None:
     data = WRITTEN[written](octets)
     [reading] = diagnose(data, key=PUBLIC).readings
     assert reading.what == "private key" and reading.verdict == "it is the given key's"
-    assert D not in str(reading), "the secret is not printed"
+    assert D not in str(reading) and repr(KEY.to_bytes()) not in repr(reading), "the secret is not printed"
     assert diagnose(data, key=OTHER).readings[0].verdict == "it is another key than the one given"
-    assert evaluated(dict(reading.calls)["smcrypto"], data) == KEY
+    assert evaluated(reading) == KEY
 
 
 @pytest.mark.parametrize("written", WRITTEN)
@@ -72,8 +63,7 @@ def test_public_keys(form: str, written: str) -> None:
     assert reading.what == "public key" and reading.verdict == "it belongs to the given key"
     assert diagnose(data, key=OTHER.public_key).readings[0].verdict == "it is of another key than the one given"
     assert diagnose(data).readings[0].verdict == ""
-    assert evaluated(dict(reading.calls)["smcrypto"], data) == PUBLIC
-    evaluated(dict(reading.calls)["gmssl"], data, **gmssl_names()).public_key.endswith(XY[-60:])
+    assert evaluated(reading) == PUBLIC
 
 
 @pytest.mark.parametrize("written", WRITTEN)
@@ -83,13 +73,7 @@ def test_signatures(uid: bytes, encoding: Any, written: str) -> None:
     data = WRITTEN[written](KEY.sign(MESSAGE, uid=uid, encoding=encoding))
     [reading] = diagnose(data, key=PUBLIC, message=MESSAGE, uid=b"ALICE123@YAHOO.COM").readings
     assert reading.what == "signature" and reading.verdict == f"holds for the key, with uid {uid!r}"
-    calls = dict(reading.calls)
-    assert len(calls) == 5 and uid.decode() in calls["openssl"] and uid.decode() in calls["sm-crypto"]
-    evaluated(calls["smcrypto"], data, key=PUBLIC, message=MESSAGE)
-    if uid == sm2.DEFAULT_UID:
-        assert evaluated(calls["gmssl"], data, message=MESSAGE, **gmssl_names())
-    else:
-        assert "fixed" in calls["gmssl"]
+    evaluated(reading, key=PUBLIC, message=MESSAGE)
     assert "does not hold" in diagnose(data, key=PUBLIC, message=b"another").readings[0].verdict
     assert "give the message" in diagnose(data, key=PUBLIC).readings[0].verdict
     assert diagnose(data).readings[0].verdict == ""
@@ -104,8 +88,7 @@ def test_signatures_without_z(e: bytes, story: str) -> None:
     data = KEY.sign_digest(e, encoding="raw").hex()
     [reading] = diagnose(data, key=KEY, message=MESSAGE).readings
     assert story in reading.verdict and "holds" in reading.verdict
-    evaluated(dict(reading.calls)["smcrypto"], data, key=PUBLIC, e=e)
-    assert evaluated(dict(reading.calls)["gmssl"], data, e=e, **gmssl_names())
+    evaluated(reading, key=PUBLIC, e=e)
 
 
 def test_signatures_of_what_was_not_meant() -> None:
@@ -118,9 +101,7 @@ def test_signatures_of_what_was_not_meant() -> None:
     raw = KEY.sign(b"m", encoding="raw")
     exchanged = (raw[32:] + raw[:32]).hex()
     assert verdict(exchanged, b"m").endswith("; r and s are exchanged")
-    calls = dict(diagnose(exchanged, key=KEY, message=b"m").readings[0].calls)
-    evaluated(calls["smcrypto"], exchanged, key=PUBLIC, message=b"m")
-    assert raw.hex() in calls["gmssl"] and raw.hex() in calls["sm-crypto"]
+    evaluated(diagnose(exchanged, key=KEY, message=b"m").readings[0], key=PUBLIC, message=b"m")
     assert "does not hold" in verdict(raw, b"")
     assert diagnose(bytes(64)).readings == diagnose(b"\xff" * 64).readings == ()
 
@@ -133,18 +114,11 @@ def test_ciphertexts(encoding: Any, bare: bool, written: str) -> None:
     data = WRITTEN[written](octets[1:] if bare and encoding != "der" else octets)
     [reading] = diagnose(data, key=KEY).readings
     assert reading.what == "ciphertext" and reading.verdict == "opens with the key: 14 bytes"
-    calls = dict(reading.calls)
-    assert evaluated(calls["smcrypto"], data, key=KEY) == MESSAGE
-    assert evaluated(calls["gmssl"].partition("   (")[0], data, **gmssl_names()) == MESSAGE
+    assert evaluated(reading, key=KEY) == MESSAGE
     expected = 1 if encoding == "der" else 2
     assert [r.verdict for r in diagnose(data, key=OTHER).readings] == ["does not open with the key"] * expected
     # Without the private key, nothing tells the orders apart.
     assert [r.verdict for r in diagnose(data, key=PUBLIC).readings] == [""] * expected
-
-
-def test_long_ciphertexts_are_not_printed_whole() -> None:
-    report = str(diagnose(PUBLIC.encrypt(bytes(5000))))
-    assert "..." in report and len(report) < 3000
 
 
 def test_pem_and_what_holds_keys() -> None:
@@ -158,7 +132,7 @@ def test_pem_and_what_holds_keys() -> None:
         [reading] = diagnose(data, key=key).readings
         assert reading.what == what and reading.verdict in (
             "it is the given key's", "it belongs to the given key", "it holds the given key")  # fmt: skip
-        assert evaluated(dict(reading.calls)["smcrypto"], data)
+        assert evaluated(reading)
     assert diagnose(certificate.to_der(), key=KEY).readings[0].verdict == "it holds another key than the one given"
     assert diagnose(root().crl().to_pem(), key=KEY).readings[0].what == "revocation list"
     both = diagnose(KEY.to_pem() + b"and\n" + PUBLIC.to_pem())
@@ -170,8 +144,7 @@ def test_encrypted_keys() -> None:
     assert "a password is needed" in str(diagnose(sealed)) and diagnose(sealed).readings == ()
     assert diagnose(sealed, password=b"password", key=KEY).readings[0].verdict == "it is the given key's"
     assert "the password is wrong" in diagnose(sealed, password=b"pass").remarks[0]
-    call = dict(diagnose(sealed, password=b"password").readings[0].calls)["smcrypto"]
-    assert evaluated(call, sealed, password=b"password") == KEY
+    assert evaluated(diagnose(sealed, password=b"password").readings[0], password=b"password") == KEY
 
 
 def test_what_needs_another_package_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,7 +159,7 @@ def test_what_is_nearly_something_has_a_remark() -> None:
     assert "31 hex digits" not in str(diagnose("0" * 32))
     assert "odd number" in diagnose(D[:-1]).remarks[0]
     short = sm2.PrivateKey.from_int(5).to_bytes().hex()[1:]
-    assert evaluated(dict(diagnose(short).readings[0].calls)["smcrypto"], short) == sm2.PrivateKey.from_int(5)
+    assert evaluated(diagnose(short).readings[0]) == sm2.PrivateKey.from_int(5)
     assert "END line" in diagnose(KEY.to_pem()[:-10]).remarks[0]
     for written in (b"  " + KEY.to_pem(), KEY.to_pem().replace(b"\n", b"\\n")):
         assert "no line is a PEM boundary" in diagnose(written).remarks[0]

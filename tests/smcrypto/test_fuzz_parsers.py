@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smcrypto import cms, pkcs12, sm2, x509
+from smcrypto import cms, der, pkcs12, sm2, x509
 from x509_authority import NOW, root
 
 PATH = Path(__file__).resolve().parents[2] / "fuzz" / "parsers.py"
@@ -31,11 +32,13 @@ FILES = [
     ROOT.certificate.to_pem(),
     x509.CertificateSigningRequest.create(KEY, subject={"CN": "robot"}, subject_alt_names=("DNS:a",)).to_der(),
     ROOT.crl(x509.RevokedCertificate(7, NOW, "superseded")).to_der(),
-    cms.sign(b"m", parsers._KEY, parsers._CERTIFICATE, signing_time=NOW),
+    cms.sign(b"m", parsers._KEY, parsers._CERTIFICATE, signing_time=parsers._AT),
     cms.encrypt(b"m", [parsers._CERTIFICATE]),
     P12,
     pkcs12._authenticated(P12, b"password"),
     KEY.to_enveloped(parsers._KEY.public_key),
+    base64.b64encode(der.sequence(der.integer(1), der.octet_string(
+        parsers._KEY.public_key.encrypt(KEY.public_key.to_bytes()[1:] + KEY.to_bytes(), encoding="c1c3c2")[1:]))),
 ]
 
 

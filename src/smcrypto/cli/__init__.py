@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 
 from smcrypto import __version__
-from smcrypto.cli import ca, diagnosis, digest, encryption, keys, signature
+from smcrypto.cli import ca, diagnosis, digest, encryption, keys, signature, tls
 from smcrypto.errors import SMCryptoError
 
 __all__ = ["build_parser", "main"]
@@ -29,6 +29,7 @@ examples:
   python -m smcrypto encrypt --to pub.pem -o message.sm2 message.txt
   python -m smcrypto decrypt --key key.pem message.sm2
   python -m smcrypto encrypt --password-file pass.txt -o backup.enc backup.tar
+  python -m smcrypto tls bank.example:443 --ca root.pem < request.txt
   python -m smcrypto diagnose --key key.pem whatever.txt
 """
 
@@ -42,7 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"smcrypto {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="command")
-    for module in (digest, keys, signature, encryption, ca, diagnosis):
+    for module in (digest, keys, signature, encryption, ca, tls, diagnosis):
         module.add_parser(subparsers)
     return parser
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from smcrypto import pem, sm2, x509
 from smcrypto.cli import passwords
@@ -70,7 +70,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     issue = commands.add_parser("issue", help="issue a certificate for a request")
     _add_authority(issue)
     issue.add_argument("request", help="the request (PEM); '-' is stdin")
-    _add_days(issue, 365)
+    issue.add_argument("--days", type=int, metavar="N",
+                       help="valid from now for so long (default: 365, or until the CA's certificate ends)")
     issue.add_argument("--for", dest="purpose", choices=tuple(PURPOSES), default="sign",
                        help="which of TLCP's two certificates: usages (default: %(default)s)")
     issue.add_argument("--intermediate", action="store_true", help="for a CA below this one")
@@ -129,11 +130,11 @@ def _add_authority(parser: argparse.ArgumentParser) -> None:
     passwords.add_arguments(parser)
 
 
-def _days(options: argparse.Namespace) -> tuple[datetime, datetime]:
-    if not 1 <= options.days <= 36525:
+def _days(days: int) -> tuple[datetime, datetime]:
+    if not 1 <= days <= 36525:
         raise InvalidOption("--days must be between 1 and 36525, a hundred years")
     now = datetime.now(timezone.utc).replace(microsecond=0)
-    return now, now + timedelta(days=options.days)
+    return now, now + timedelta(days=days)
 
 
 _T = TypeVar("_T")
@@ -156,7 +157,7 @@ def run_init(options: argparse.Namespace) -> int:
     key_file, certificate_file, crl_file = (options.dir / f"ca.{kind}.pem" for kind in ("key", "crt", "crl"))
     for path in (key_file, certificate_file, crl_file):
         require_absent(path, force=options.force)
-    begin, end = _days(options)
+    begin, end = _days(options.days)
     key = sm2.PrivateKey.generate()
     certificate = x509.self_signed(
         key, subject=options.subject, not_before=begin, not_after=end, path_length=options.path_length,
@@ -185,68 +186,54 @@ def run_csr(options: argparse.Namespace) -> int:
 
 def run_issue(options: argparse.Namespace) -> int:
     request = x509.CertificateSigningRequest.from_pem(read_all(options.request))
-    request.verify(uid=uid_bytes(options.uid if options.request_uid is None else options.request_uid))
     ca_certificate, ca_key = _authority(options)
-    begin, end = _days(options)
+    begin, end = _days(365 if options.days is None else options.days)
+    if options.days is None:
+        end = min(end, max(begin, ca_certificate.not_after))
     granted = list(request.subject_alt_names) if options.requested_names else []
     certificate = x509.issue(
         request, ca_certificate, ca_key, not_before=begin, not_after=end, ca=options.intermediate,
         path_length=options.path_length, subject_alt_names=list(dict.fromkeys(options.san + granted)),
         extended_key_usage=options.extended_key_usage,
         key_usage=None if options.intermediate else PURPOSES[options.purpose], uid=uid_bytes(options.uid),
+        request_uid=uid_bytes(options.uid if options.request_uid is None else options.request_uid),
     )  # fmt: skip
-    _require_useful(certificate, ca_certificate, begin, uid_bytes(options.uid))
+    # A certificate that nobody would accept is not handed out.
+    x509.verify_chain(certificate, roots=[ca_certificate], at=begin, uid=uid_bytes(options.uid))
+    constraints = ca_certificate.basic_constraints
+    if options.intermediate and constraints is not None and constraints.path_length == 0:
+        raise CertificateError(f"{ca_certificate.subject} allows no CA below it (path length 0)")
     write_output(options.output, [certificate.to_pem()])
     return 0
 
 
-def _require_useful(certificate: x509.Certificate, ca: x509.Certificate, at: datetime, uid: bytes) -> None:
-    """A certificate that nobody would accept is not handed out."""
-    x509.verify_chain(certificate, roots=[ca], at=at, uid=uid)
-    constraints = ca.basic_constraints
-    if certificate.is_ca and constraints is not None and constraints.path_length == 0:
-        raise CertificateError(f"{ca.subject} allows no CA below it (path length 0)")
-    if certificate.not_after > ca.not_after:
-        raise CertificateError(f"the CA's certificate ends first, at {ca.not_after}; give fewer --days")
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """One process at a time: of two lists made at once, the later would lack what the earlier revokes."""
-    with (folder / "ca.crt.pem").open("rb") as held:
+def run_revoke(options: argparse.Namespace) -> int:
+    certificate, key = _authority(options)
+    uid = uid_bytes(options.uid)
+    path = options.dir / "ca.crl.pem"
+    entries: dict[int, x509.RevokedCertificate] = {}
+    number = 0
+    # One process at a time: of two lists made at once, the later would lack what the earlier revokes.
+    with (options.dir / "ca.crt.pem").open("rb") as held:
         with contextlib.suppress(ImportError, OSError):  # not on Windows, nor on every network's file system
             import fcntl
 
             fcntl.flock(held, fcntl.LOCK_EX)
-        yield
-
-
-def run_revoke(options: argparse.Namespace) -> int:
-    certificate, key = _authority(options)
-    with _alone(options.dir):
-        return _revoke(options, certificate, key)
-
-
-def _revoke(options: argparse.Namespace, certificate: x509.Certificate, key: sm2.PrivateKey) -> int:
-    uid = uid_bytes(options.uid)
-    path = options.dir / "ca.crl.pem"
-    entries: list[x509.RevokedCertificate] = []
-    number = 0
-    if path.exists():
-        old = _read(path, x509.CertificateRevocationList.from_pem)
-        old.verify(certificate, uid=uid)
-        entries += old.revoked
-        number = (old.number or 0) + 1
-    begin, end = _days(options)
-    for file in options.certificates:
-        revoked = _read(file, x509.Certificate.from_pem)
-        revoked.verify_signature(certificate, uid=uid)
-        if all(entry.serial_number != revoked.serial_number for entry in entries):
-            entries.append(x509.RevokedCertificate(revoked.serial_number, begin, options.reason))
-    crl = x509.CertificateRevocationList.create(
-        certificate, key, revoked=entries, this_update=begin, next_update=end, number=number, uid=uid
-    )
-    write_output(path, [crl.to_pem()])
+        if path.exists():
+            old = _read(path, x509.CertificateRevocationList.from_pem)
+            old.verify(certificate, uid=uid)
+            entries |= {entry.serial_number: entry for entry in old.revoked}
+            number = (old.number or 0) + 1
+        begin, end = _days(options.days)
+        for file in options.certificates:
+            revoked = _read(file, x509.Certificate.from_pem)
+            revoked.verify_signature(certificate, uid=uid)
+            entry = x509.RevokedCertificate(revoked.serial_number, begin, options.reason)
+            entries.setdefault(revoked.serial_number, entry)
+        crl = x509.CertificateRevocationList.create(
+            certificate, key, revoked=entries.values(), this_update=begin, next_update=end, number=number, uid=uid
+        )
+        write_output(path, [crl.to_pem()])
     print(f"{path}: {len(entries)} revoked, valid until {end}", file=sys.stderr)
     return 0
 
@@ -289,68 +276,55 @@ def run_show(options: argparse.Namespace) -> int:
     blocks = pem.decode(read_all(options.file), certificates + requests + x509.CertificateRevocationList.LABELS)
     for label, content in blocks:
         if label in certificates:
-            print(_describe_certificate(x509.Certificate.from_der(content)))
+            _print_fields("certificate", x509.load_der_certificate(content))
         elif label in requests:
-            print(_describe_request(x509.CertificateSigningRequest.from_der(content)))
+            _print_fields("certificate request", x509.CertificateSigningRequest.from_der(content))
         else:
-            print(_describe_crl(x509.CertificateRevocationList.from_der(content)))
+            crl = x509.CertificateRevocationList.from_der(content)
+            _print_fields("revocation list", crl)
+            for entry in crl.revoked:
+                print(f"    {entry.serial_number:x} at {entry.revoked_at}: {entry.reason}")
     if not blocks:
         raise CertificateError("no certificate, request or revocation list in PEM (`diagnose` reads DER as well)")
     return 0
 
 
-_ONE_A_LINE = "\n" + 24 * " "  # a name may have commas and blanks in it
+def _one_a_line(names: tuple[str, ...]) -> str | None:
+    return ("\n" + 24 * " ").join(names) or None  # a name may have commas and blanks in it
 
 
-def _lines(title: str, fields: dict[str, object]) -> str:
-    return "\n".join([title, *(f"  {name + ':':22}{value}" for name, value in fields.items() if value is not None)])
+def _constraints(constraints: x509.BasicConstraints) -> str:
+    length = "" if constraints.path_length is None else f", path length {constraints.path_length}"
+    return ("yes" if constraints.ca else "no") + length
 
 
-def _listed(names: tuple[str, ...] | frozenset[str] | None) -> str | None:
-    if not names:
-        return None
-    return ", ".join(sorted(names) if isinstance(names, frozenset) else names)
+_FIELDS: tuple[tuple[str, str, Callable[[Any], object]], ...] = (
+    ("subject", "subject", str),
+    ("issuer", "issuer", str),
+    ("serial number", "serial_number", "{:x}".format),
+    ("not before", "not_before", str),
+    ("not after", "not_after", str),
+    ("key", "algorithm", lambda name: None if name == "SM2" else name),
+    ("odd", "oddities", _one_a_line),
+    ("CA", "basic_constraints", _constraints),
+    ("key usage", "key_usage", lambda names: ", ".join(sorted(names))),
+    ("extended key usage", "extended_key_usage", ", ".join),
+    ("alternative names", "subject_alt_names", _one_a_line),
+    ("key identifier", "subject_key_identifier", bytes.hex),
+    ("public key", "public_key", lambda key: key.to_bytes().hex()),
+    ("SM3 fingerprint", "fingerprint", lambda fingerprint: fingerprint().hex()),
+    ("number", "number", str),
+    ("this update", "this_update", str),
+    ("next update", "next_update", str),
+    ("revoked", "revoked", len),
+)
+"""What is shown of certificates, requests and lists, in this order: its title, the attribute, and how that is written;
+nothing where the attribute, or what is written of it, is None."""
 
 
-def _describe_certificate(certificate: x509.Certificate) -> str:
-    constraints = certificate.basic_constraints
-    ca = None
-    if constraints is not None:
-        length = "" if constraints.path_length is None else f", path length {constraints.path_length}"
-        ca = ("yes" if constraints.ca else "no") + length
-    identifier = certificate.subject_key_identifier
-    return _lines("certificate", {
-        "subject": certificate.subject,
-        "issuer": certificate.issuer,
-        "serial number": f"{certificate.serial_number:x}",
-        "not before": certificate.not_before,
-        "not after": certificate.not_after,
-        "CA": ca,
-        "key usage": _listed(certificate.key_usage),
-        "extended key usage": _listed(certificate.extended_key_usage),
-        "alternative names": _ONE_A_LINE.join(certificate.subject_alt_names) or None,
-        "key identifier": None if identifier is None else identifier.hex(),
-        "public key": certificate.public_key.to_bytes().hex(),
-        "SM3 fingerprint": certificate.fingerprint().hex(),
-    })  # fmt: skip
-
-
-def _describe_request(request: x509.CertificateSigningRequest) -> str:
-    return _lines("certificate request", {
-        "subject": request.subject,
-        "key usage": _listed(request.key_usage),
-        "extended key usage": _listed(request.extended_key_usage),
-        "alternative names": _ONE_A_LINE.join(request.subject_alt_names) or None,
-        "public key": request.public_key.to_bytes().hex(),
-    })  # fmt: skip
-
-
-def _describe_crl(crl: x509.CertificateRevocationList) -> str:
-    head = _lines("revocation list", {
-        "issuer": crl.issuer,
-        "number": crl.number,
-        "this update": crl.this_update,
-        "next update": crl.next_update,
-        "revoked": len(crl.revoked),
-    })  # fmt: skip
-    return "\n".join([head, *(f"    {e.serial_number:x} at {e.revoked_at}: {e.reason}" for e in crl.revoked)])
+def _print_fields(title: str, shown: object) -> None:
+    print(title)
+    for name, attribute, written in _FIELDS:
+        value = getattr(shown, attribute, None)
+        if value is not None and (text := written(value)) is not None:
+            print(f"  {name + ':':22}{text}")

@@ -1,4 +1,4 @@
-"""`diagnose`: what a key, point, signature or ciphertext is, whether it fits, and the calls that read it."""
+"""`diagnose`: what a key, point, signature or ciphertext is, whether it fits, and the call that reads it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "diagnose", help="what is this, and how is it read",
         description="Say what a key, point, signature or ciphertext is (hex, base64, PEM, DER or raw), whether it fits"
-                    " a key, and the calls that read it here, in gmssl, sm-crypto, Bouncy Castle and openssl."
-                    " Exit with 1 where nothing is known of it.")
+                    " a key, and the call that reads it. Exit with 1 where nothing is known of it.")
     parser.add_argument("--key", type=Path, metavar="FILE", help="a private or public key in any form, to try on it")
     parser.add_argument("--message", type=Path, metavar="FILE", help="what a signature should be of")
     parser.add_argument("--uid", metavar="TEXT", help="a distinguishing id to try beside the usual ones")

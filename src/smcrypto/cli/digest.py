@@ -25,25 +25,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_hash(options: argparse.Namespace) -> int:
-    for name in options.files:
-        state = sm3.SM3()
-        for chunk in chunks(name):
-            state.update(chunk)
-        _print(state.hexdigest(), name)
-    return 0
+    return _print_digests(options.files, sm3.SM3())
 
 
 def run_hmac(options: argparse.Namespace) -> int:
-    key = options.key_file.read_bytes()
-    for name in options.files:
-        state = hmac.new(key, digestmod=sm3.SM3)
+    return _print_digests(options.files, hmac.new(options.key_file.read_bytes(), digestmod=sm3.SM3))
+
+
+def _print_digests(names: list[str], start: sm3.SM3 | hmac.HMAC) -> int:
+    """Lines of sha256sum: a name that would break one is escaped, and a backslash before the digest says so."""
+    for name in names:
+        state = start.copy()
         for chunk in chunks(name):
             state.update(chunk)
-        _print(state.hexdigest(), name)
+        escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
+        print(f"{'' if escaped == name else chr(92)}{state.hexdigest()}  {escaped}")
     return 0
-
-
-def _print(digest: str, name: str) -> None:
-    """A line of sha256sum: a name that would break it is escaped, and a backslash before the digest says so."""
-    escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
-    print(f"{'' if escaped == name else chr(92)}{digest}  {escaped}")

@@ -30,30 +30,24 @@ DEFAULT_ITERATIONS = 100_000
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    encrypt = subparsers.add_parser("encrypt", help="encrypt a file", description=__doc__,
-                                    formatter_class=argparse.RawDescriptionHelpFormatter)
-    encrypt.add_argument("--to", type=Path, metavar="FILE", help="recipient's SM2 public key (PEM)")
-    _add_common(encrypt)
-    encrypt.set_defaults(run=run_encrypt)
-
-    decrypt = subparsers.add_parser("decrypt", help="decrypt a file", description=__doc__,
-                                    formatter_class=argparse.RawDescriptionHelpFormatter)
-    decrypt.add_argument("--key", type=Path, metavar="FILE", help="own SM2 private key (PEM)")
-    _add_common(decrypt)
-    decrypt.set_defaults(run=run_decrypt)
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--encoding", choices=("der", "c1c3c2", "c1c2c3"), default="der",
-                        help="form of an SM2 ciphertext (default: %(default)s)")
-    passwords.add_arguments(parser)
-    parser.add_argument("--iterations", type=int, default=DEFAULT_ITERATIONS,
-                        help="of PBKDF2 under a password; openssl's -iter (default: %(default)s)")
-    parser.add_argument("--sm4-key-file", type=Path, metavar="FILE", help="SM4 key: the 16 bytes of FILE")
-    parser.add_argument("--iv", metavar="HEX", help="with --sm4-key-file: 32 hex digits, never used twice")
-    parser.add_argument("--mode", choices=tuple(MODES), help="SM4 mode (default: cbc)")
-    add_output(parser)
-    add_input(parser)
+    for name, run, option, key in (
+        ("encrypt", run_encrypt, "--to", "recipient's SM2 public key (PEM)"),
+        ("decrypt", run_decrypt, "--key", "own SM2 private key (PEM)"),
+    ):
+        parser = subparsers.add_parser(name, help=f"{name} a file", description=__doc__,
+                                       formatter_class=argparse.RawDescriptionHelpFormatter)
+        parser.add_argument(option, type=Path, metavar="FILE", help=key)
+        parser.add_argument("--encoding", choices=("der", "c1c3c2", "c1c2c3"), default="der",
+                            help="form of an SM2 ciphertext (default: %(default)s)")
+        passwords.add_arguments(parser)
+        parser.add_argument("--iterations", type=int, default=DEFAULT_ITERATIONS,
+                            help="of PBKDF2 under a password; openssl's -iter (default: %(default)s)")
+        parser.add_argument("--sm4-key-file", type=Path, metavar="FILE", help="SM4 key: the 16 bytes of FILE")
+        parser.add_argument("--iv", metavar="HEX", help="with --sm4-key-file: 32 hex digits, never used twice")
+        parser.add_argument("--mode", choices=tuple(MODES), help="SM4 mode (default: cbc)")
+        add_output(parser)
+        add_input(parser)
+        parser.set_defaults(run=run)
 
 
 def _require_one_secret(options: argparse.Namespace, key_file: Path | None, name: str) -> None:
@@ -69,23 +63,20 @@ def _require_one_secret(options: argparse.Namespace, key_file: Path | None, name
         raise InvalidOption("--sm4-key-file needs --iv")
 
 
-def _cipher(key: bytes, iv: bytes, options: argparse.Namespace) -> sm4.Cipher:
+def _cipher(options: argparse.Namespace, salt: bytes, prompt: str, *, confirm: bool = False) -> sm4.Cipher:
+    """Under the SM4 key that is given, or under a password: key and IV as `openssl enc -pbkdf2 -md sm3` has them."""
+    if options.sm4_key_file is not None:
+        try:
+            iv = bytes.fromhex(options.iv)
+        except ValueError:
+            raise InvalidOption("--iv must be hex") from None
+        key = options.sm4_key_file.read_bytes()
+    else:
+        password = passwords.read_password(options, prompt, confirm=confirm)
+        derived = kdf.pbkdf2_hmac(password, salt, options.iterations, 32)
+        key, iv = derived[:16], derived[16:]
     mode = options.mode or "cbc"
     return sm4.Cipher(key, MODES[mode](iv), padding="pkcs7" if mode == "cbc" else None)
-
-
-def _explicit(options: argparse.Namespace) -> tuple[bytes, bytes]:
-    try:
-        iv = bytes.fromhex(options.iv)
-    except ValueError:
-        raise InvalidOption("--iv must be hex") from None
-    return options.sm4_key_file.read_bytes(), iv
-
-
-def _from_password(password: bytes, salt: bytes, options: argparse.Namespace) -> tuple[bytes, bytes]:
-    """Key and IV as `openssl enc -pbkdf2 -md sm3` derives them: 32 bytes at once."""
-    derived = kdf.pbkdf2_hmac(password, salt, options.iterations, 32)
-    return derived[:16], derived[16:]
 
 
 def _streamed(context: sm4.CipherStream, pieces: Iterable[bytes]) -> Iterator[bytes]:
@@ -102,15 +93,10 @@ def run_encrypt(options: argparse.Namespace) -> int:
         sealed = load_public(options.to).encrypt(read_all(options.file), encoding=options.encoding)
         write_output(options.output, [sealed])
         return 0
-    head = b""
-    if options.sm4_key_file is not None:
-        key, iv = _explicit(options)
-    else:
-        salt = secrets.token_bytes(SALT_SIZE)
-        key, iv = _from_password(passwords.read_password(options, "New password", confirm=True), salt, options)
-        head = MAGIC + salt
-    body = _streamed(_cipher(key, iv, options).encryptor(), chunks(options.file))
-    write_output(options.output, chain([head], body))
+    salt = secrets.token_bytes(SALT_SIZE)
+    head = MAGIC + salt if options.sm4_key_file is None else b""
+    cipher = _cipher(options, salt, "New password", confirm=True)
+    write_output(options.output, chain([head], _streamed(cipher.encryptor(), chunks(options.file))))
     return 0
 
 
@@ -120,15 +106,12 @@ def run_decrypt(options: argparse.Namespace) -> int:
         message = load_private(options.key, options).decrypt(read_all(options.file), encoding=options.encoding)
         write_output(options.output, [message])
         return 0
-    pieces = chunks(options.file)
-    if options.sm4_key_file is not None:
-        key, iv = _explicit(options)
-    else:
+    pieces, salt = chunks(options.file), b""
+    if options.sm4_key_file is None:
         first = next(pieces, b"")  # CHUNK bytes, or all there is
         magic, salt, rest = first[:8], first[8:16], first[16:]
         if magic != MAGIC or len(salt) != SALT_SIZE:
             raise InvalidCiphertext("not encrypted under a password: the file has no 'Salted__' and salt at its start")
-        key, iv = _from_password(passwords.read_password(options, "Password"), salt, options)
         pieces = chain([rest], pieces)
-    write_output(options.output, _streamed(_cipher(key, iv, options).decryptor(), pieces))
+    write_output(options.output, _streamed(_cipher(options, salt, "Password").decryptor(), pieces))
     return 0

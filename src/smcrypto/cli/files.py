@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import stat
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from smcrypto.errors import InvalidOption
 
@@ -28,20 +26,10 @@ def add_output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write here instead of to stdout")
 
 
-@contextlib.contextmanager
-def _opened(name: str) -> Iterator[tuple[BinaryIO, int]]:
-    """The input and its size, 0 where that cannot be known before."""
-    if name == "-":
-        yield sys.stdin.buffer, 0
-        return
-    with Path(name).open("rb") as stream:
-        status = os.fstat(stream.fileno())
-        yield stream, status.st_size if stat.S_ISREG(status.st_mode) else 0
-
-
 def chunks(name: str) -> Iterator[bytes]:
     """The input in pieces of CHUNK bytes; a bar on stderr where it is large and stderr is a terminal."""
-    with _opened(name) as (stream, size):
+    with contextlib.nullcontext(sys.stdin.buffer) if name == "-" else Path(name).open("rb") as stream:
+        size = 0 if name == "-" else os.fstat(stream.fileno()).st_size  # of a pipe or device it is 0
         bar = size >= PROGRESS_FROM and sys.stderr.isatty()
         done = 0
         while chunk := stream.read(CHUNK):
@@ -49,9 +37,8 @@ def chunks(name: str) -> Iterator[bytes]:
             done += len(chunk)
             if bar:
                 share = min(done / size, 1.0)  # the file may grow while it is read
-                filled = int(40 * share)
-                drawn = f"[{'#' * filled}{'.' * (40 - filled)}]"
-                print(f"\r{name} {drawn} {share:4.0%}", end="", file=sys.stderr, flush=True)
+                filled = "#" * int(40 * share)
+                print(f"\r{name} [{filled:.<40}] {share:4.0%}", end="", file=sys.stderr, flush=True)
         if bar:
             print(file=sys.stderr)
 
@@ -72,8 +59,7 @@ def write_output(path: Path | None, pieces: Iterable[bytes]) -> None:
     So a decryption that fails at its end leaves no half-written plaintext behind in a file.
     """
     if path is None:
-        for piece in pieces:
-            sys.stdout.buffer.write(piece)
+        sys.stdout.buffer.writelines(pieces)
         sys.stdout.buffer.flush()
         return
     umask = os.umask(0)

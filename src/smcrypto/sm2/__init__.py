@@ -22,9 +22,9 @@ run code on the same processor core or measure single operations.
 
 from __future__ import annotations
 
-from smcrypto.sm2.curve import SM2P256V1, Curve
+from smcrypto.sm2.curve import SM2P256V1
 from smcrypto.sm2.exchange import KeyExchange
 from smcrypto.sm2.keys import PrivateKey, PublicKey
 from smcrypto.sm2.signature import DEFAULT_UID
 
-__all__ = ["DEFAULT_UID", "SM2P256V1", "Curve", "KeyExchange", "PrivateKey", "PublicKey"]
+__all__ = ["DEFAULT_UID", "SM2P256V1", "KeyExchange", "PrivateKey", "PublicKey"]

@@ -25,7 +25,7 @@ Point: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """y^2 = x^3 + a*x + b over F_p, p an odd prime, with a base point G of odd prime order n and cofactor h."""
+    """y^2 = x^3 + a*x + b over F_p, p = 3 mod 4 a prime, with a base point G of odd prime order n, cofactor 1."""
 
     name: str
     p: int
@@ -33,7 +33,6 @@ class Curve:
     b: int
     n: int
     G: Point
-    h: int = 1
 
     def __hash__(self) -> int:
         return hash((self.p, self.n))
@@ -70,12 +69,10 @@ SM2P256V1: Final = Curve(
 def require_point(point: Point, curve: Curve) -> Point:
     """`point` again if it is a public key of `curve`, else InvalidKey (GB/T 32918.1, 6.2.1).
 
-    Step 4, [n]P = O, holds for every point when h = 1 and is computed otherwise.
+    Step 4, [n]P = O, holds for every point, the cofactor being 1.
     """
     if not curve.holds(point):
         raise InvalidKey("the point is not on the curve")
-    if curve.h != 1 and plain_multiple(curve.n, point, curve) is not None:
-        raise InvalidKey("the point is not in the group of order n")
     return point
 
 
@@ -100,45 +97,9 @@ def decode_point(data: bytes, curve: Curve, *, allow_compressed: bool = True) ->
         return require_point((x, int.from_bytes(data[1 + size :], "big")), curve)
     if allow_compressed and len(data) == 1 + size and data[0] in (2, 3):
         x = int.from_bytes(data[1:], "big")
-        y = square_root((x * x + curve.a) * x + curve.b, curve.p)
+        # A root where there is one, B.1.4 for p = 3 mod 4; otherwise the point is not on the curve.
+        y = pow((x * x + curve.a) * x + curve.b, (curve.p + 1) // 4, curve.p)
         if y & 1 != data[0] & 1:
             y = curve.p - y
         return require_point((x, y), curve)
     raise InvalidKey("not an encoded point")
-
-
-def square_root(value: int, p: int) -> int:
-    """A square root of `value` modulo p if it has one; otherwise a number that is not its root.
-
-    p = 3 mod 4: value^((p+1)/4) (GB/T 32918.1, B.1.4). The caller checks the result.
-    """
-    if p % 4 != 3:
-        raise NotImplementedError("square roots are taken modulo primes p = 3 mod 4 only")
-    return pow(value, (p + 1) // 4, p)
-
-
-def plain_add(P: Point | None, Q: Point | None, curve: Curve) -> Point | None:
-    """P + Q by the definition (GB/T 32918.1, 3.2.3.1), None for infinity. For public values; one inversion."""
-    if P is None or Q is None:
-        return P or Q
-    p = curve.p
-    (x1, y1), (x2, y2) = P, Q
-    if x1 == x2:
-        if (y1 + y2) % p == 0:
-            return None
-        slope = (3 * x1 * x1 + curve.a) * pow(2 * y1, -1, p) % p
-    else:
-        slope = (y2 - y1) * pow(x2 - x1, -1, p) % p
-    x3 = (slope * slope - x1 - x2) % p
-    return x3, (slope * (x1 - x3) - y1) % p
-
-
-def plain_multiple(k: int, P: Point | None, curve: Curve) -> Point | None:
-    """[k]P for k >= 0 and any point, by double and add. For public values only: its steps depend on k."""
-    result: Point | None = None
-    while k:
-        if k & 1:
-            result = plain_add(result, P, curve)
-        P = plain_add(P, P, curve)
-        k >>= 1
-    return result

@@ -79,12 +79,9 @@ def decode_ciphertext(ciphertext: bytes, curve: Curve, encoding: str) -> tuple[P
     """(C1, C3, C2), C1 on the curve (step B1); InvalidCiphertext for anything else."""
     try:
         if encoding == "der":
-            whole = der.Reader(ciphertext)
-            body = whole.sequence()
-            whole.finish()
-            C1 = require_point((body.integer(), body.integer()), curve)
-            C3, C2 = body.octet_string(), body.octet_string()
-            body.finish()
+            with der.reading_sequence(ciphertext) as body:
+                C1 = require_point((body.integer(), body.integer()), curve)
+                C3, C2 = body.octet_string(), body.octet_string()
         else:
             size = 1 + 2 * curve.field_bytes
             C1 = decode_point(ciphertext[:size], curve, allow_compressed=False)

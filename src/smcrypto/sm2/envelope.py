@@ -17,6 +17,7 @@ from typing import Final
 
 from smcrypto import der
 from smcrypto.errors import InvalidEncoding, InvalidKey
+from smcrypto.sm2.keyfiles import standard_point
 from smcrypto.sm2.keys import PrivateKey, PublicKey
 
 __all__ = ["open_key", "seal_key"]
@@ -29,7 +30,7 @@ def seal_key(key: PrivateKey, recipient: PublicKey) -> bytes:
     """`key` for the holder of `recipient`'s private key, in DER."""
     from smcrypto import sm4
 
-    point = key.public_key._standard_bytes()
+    point = standard_point(key.public_key)
     symmetric = secrets.token_bytes(16)
     return der.sequence(
         der.sequence(der.oid(_ALGORITHMS[0]), der.null()),
@@ -47,17 +48,15 @@ def open_key(data: bytes, key: PrivateKey) -> PrivateKey:
     from smcrypto import sm4
 
     try:
-        members = der.only_sequence(data)
-        algorithm = members.sequence()
-        name = algorithm.oid()
-        if name not in _ALGORITHMS:
-            raise InvalidEncoding(f"the key is encrypted by {name}, not by SM4 in ECB mode")
-        if not algorithm.at_end():
-            algorithm.null()
-        algorithm.finish()
-        sealed = members.raw()
-        point, ciphertext = members.bit_string(), members.bit_string()
-        members.finish()
+        with der.reading_sequence(data) as members:
+            algorithm = members.sequence()
+            name = algorithm.oid()
+            if name not in _ALGORITHMS:
+                raise InvalidEncoding(f"the key is encrypted by {name}, not by SM4 in ECB mode")
+            if not algorithm.at_end():
+                algorithm.null()
+            sealed = members.raw()
+            point, ciphertext = members.bit_string(), members.bit_string()
         if len(ciphertext) != 32:
             raise InvalidEncoding(f"the encrypted private key has {len(ciphertext)} bytes, not 32")
     except InvalidEncoding as error:

@@ -20,31 +20,21 @@ import hashlib
 import hmac
 import secrets
 from collections.abc import Callable
-from functools import partial
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
-from smcrypto import der, pem
+from smcrypto import cbc, der, kdf, pem, sm3
 from smcrypto.errors import InvalidEncoding, InvalidKey, InvalidOption, InvalidPadding, MissingDependency
+from smcrypto.inputs import BytesLike, as_bytes
 from smcrypto.sm2.curve import SM2P256V1, encode_point
-from smcrypto.sm2.points import base_comb, secret_sum, to_affine_all
+from smcrypto.sm2.keys import Format, Prf, PrivateKey, PublicKey
 
 __all__ = [
-    "ITERATIONS",
-    "MAX_ITERATIONS",
-    "MAX_PURE_ITERATIONS",
-    "MAX_SCRYPT_BLOCKS",
-    "MAX_SCRYPT_MEMORY",
-    "dump_private",
-    "dump_public",
-    "load_private",
-    "load_public",
-    "read_pbes2",
+    "ITERATIONS", "MAX_ITERATIONS", "MAX_PURE_ITERATIONS", "MAX_SCRYPT_BLOCKS", "MAX_SCRYPT_MEMORY", "ForeignKey",
+    "NotOpened", "Prf", "dump_private", "dump_public", "load_private", "load_public", "read_pbes2", "standard_point",
     "write_pbes2",
-]
+]  # fmt: skip
 
 Form = Literal["pem", "der"]
-Format = Literal["pkcs8", "sec1"]
-Prf = Literal["sm3", "sha256"]
 
 ITERATIONS: Final = 100_000
 """PBKDF2 iterations of the keys we write (OpenSSL 3.0 writes 2,048, GmSSL 65,536)."""
@@ -63,30 +53,21 @@ _SM2: Final = "1.2.156.10197.1.301"  # GM/T 0006: sm2p256v1, also SM2 as an algo
 _PBES2: Final = "1.2.840.113549.1.5.13"  # RFC 8018, A.4
 _PBKDF2: Final = "1.2.840.113549.1.5.12"  # RFC 8018, A.2
 _SCRYPT: Final = "1.3.6.1.4.1.11591.4.11"  # RFC 7914, 7
-_HMAC_SHA1: Final = "1.2.840.113549.2.7"
+_HMAC_SHA256: Final = "1.2.840.113549.2.9"
 _HMAC_SM3: Final = "1.2.156.10197.1.401.2"
-_SM4_CBC: Final = "1.2.156.10197.1.104.2"
 
-# Pseudorandom functions of PBKDF2, RFC 8018, B.1.2. GM/T 0091 gives HMAC-SM3 two identifiers: annex C the one
-# above, which GmSSL uses, annex A the one ending in 401.3.1, which OpenSSL has used since it has one.
+# Pseudorandom functions of PBKDF2, RFC 8018, B.1.2, but for the default, HMAC-SHA-1, which is never spelt out in DER.
+# GM/T 0091 gives HMAC-SM3 two identifiers: annex C the one above, which GmSSL uses, annex A the one ending in 401.3.1,
+# which OpenSSL has used since it has one.
 _PRFS: Final = {
-    _HMAC_SHA1: "sha1",
     "1.2.840.113549.2.8": "sha224",
-    "1.2.840.113549.2.9": "sha256",
+    _HMAC_SHA256: "sha256",
     "1.2.840.113549.2.10": "sha384",
     "1.2.840.113549.2.11": "sha512",
     _HMAC_SM3: "sm3",
     "1.2.156.10197.1.401.3.1": "sm3",
 }
-# Block ciphers in CBC mode: name, key bytes, block bytes.
-_CIPHERS: Final = {
-    _SM4_CBC: ("SM4", 16, 16),
-    "2.16.840.1.101.3.4.1.2": ("AES", 16, 16),
-    "2.16.840.1.101.3.4.1.22": ("AES", 24, 16),
-    "2.16.840.1.101.3.4.1.42": ("AES", 32, 16),
-    "1.2.840.113549.3.7": ("TripleDES", 24, 8),
-}
-
+_ALGORITHM: Final = der.sequence(der.oid(_EC_PUBLIC_KEY), der.oid(_SM2))  # as it is written
 _PKCS8_LABEL: Final = "PRIVATE KEY"
 _ENCRYPTED_LABEL: Final = "ENCRYPTED PRIVATE KEY"
 _SEC1_LABELS: Final = ("EC PRIVATE KEY", "SM2 PRIVATE KEY")
@@ -98,149 +79,149 @@ _PUBLIC_LABEL: Final = "PUBLIC KEY"
 # --- reading ---
 
 
-def load_private(data: bytes, password: bytes | None, *, form: Form) -> int:
-    """d of the first private key in `data`; it is in [0, 2**256), the caller judges its range.
+class ForeignKey(InvalidEncoding):
+    """The key is of another algorithm or curve than SM2's."""
 
+
+class NotOpened(InvalidEncoding):
+    """The password is missing, wrong or superfluous, or the encryption is one that is not read here."""
+
+
+def load_private(data: BytesLike, password: BytesLike | None, *, form: Form) -> PrivateKey:
+    """The private key in `data`: in a PEM file the first one of SM2 that can be read with this password.
+
+    Keys of other algorithms are passed over there, and encrypted ones that the password does not open.
     InvalidKey: malformed, of another curve, contradicting its public key,
-    encrypted and no or the wrong password given, or not encrypted and one given.
+    encrypted and no or the wrong password given, or not encrypted and one given. Its cause, if that is a ForeignKey
+    or NotOpened, tells those from what is malformed.
     """
+    octets, secret = as_bytes(data, "data"), None if password is None else as_bytes(password, "password")
     try:
-        if form == "pem":
-            return _private_from_pem(data, password)
-        _require_form(form)
-        return _private_from_der(data, password)
+        return _private_from_pem(octets, secret) if form == "pem" else _private_from_der(octets, secret)
+    except NotOpened as error:
+        raise InvalidKey(str(error)) from error
     except InvalidEncoding as error:
-        raise InvalidKey(f"not an SM2 private key: {error}") from None
+        raise InvalidKey(f"not an SM2 private key: {error}") from error
 
 
-def load_public(data: bytes, *, form: Form) -> bytes:
-    """The SEC1 point of a SubjectPublicKeyInfo, as it stands there; the caller checks that it is on the curve."""
+def load_public(data: BytesLike, *, form: Form) -> PublicKey:
+    """The key of a SubjectPublicKeyInfo: in a PEM file the first one of SM2. InvalidKey for anything else."""
+    octets = as_bytes(data, "data")
     try:
-        if form == "pem":
-            data = pem.first(data, [_PUBLIC_LABEL]).der
-        else:
-            _require_form(form)
-        info = der.only_sequence(data)
+        if form == "der":
+            return _read_public(octets)
+        passed_over = InvalidEncoding(f"no PEM block labelled {_PUBLIC_LABEL}")
+        for block in pem.decode(octets, [_PUBLIC_LABEL]):
+            try:
+                return _read_public(block.der)
+            except ForeignKey as error:
+                passed_over = error
+        raise passed_over
+    except InvalidEncoding as error:
+        raise InvalidKey(f"not an SM2 public key: {error}") from error
+
+
+def _read_public(data: bytes) -> PublicKey:
+    with der.reading_sequence(data) as info:
         _read_algorithm(info)
-        point = info.bit_string()
-        info.finish()
-    except InvalidEncoding as error:
-        raise InvalidKey(f"not an SM2 public key: {error}") from None
-    return point
+        return PublicKey.from_bytes(info.bit_string())
 
 
-def _require_form(form: str) -> None:
-    if form not in ("pem", "der"):
-        raise InvalidOption(f"form must be 'pem' or 'der', not {form!r}")
+def _private_from_pem(data: bytes, password: bytes | None) -> PrivateKey:
+    parameters: bytes | None = None
+    passed_over: Exception = InvalidEncoding(f"no PEM block labelled {' or '.join(_PRIVATE_LABELS)}")
+    work = 0
+    for label, lines in tuple(pem.armoured(data, [_PARAMETERS_LABEL, *_PRIVATE_LABELS])):  # to the end of the file
+        try:
+            content = pem.unarmoured(lines)
+            if label == _PARAMETERS_LABEL:
+                parameters = content
+            elif label == _ENCRYPTED_LABEL:
+                opened, cost = _read_encrypted(content)
+                if (work := work + cost) > MAX_ITERATIONS:
+                    raise InvalidKey(f"the keys ask for {work} iterations in all; the limit is {MAX_ITERATIONS}")
+                return opened(password)
+            elif label == _PKCS8_LABEL:
+                return _unencrypted(_read_pkcs8(content), password)
+            else:
+                before, parameters = parameters, None
+                if before is not None:
+                    der.parse(before, _read_curve)
+                curve_known = before is not None or label != "EC PRIVATE KEY"
+                return _unencrypted(_read_sec1(content, curve_known=curve_known), password)
+        except (ForeignKey, NotOpened, pem.EncryptedBlock, MissingDependency) as error:
+            if not isinstance(passed_over, NotOpened):
+                passed_over = error
+    raise passed_over
 
 
-def _private_from_pem(data: bytes, password: bytes | None) -> int:
-    curve_known = False
-    for label, content in pem.decode(data):
-        if label == _PARAMETERS_LABEL:
-            parameters = der.Reader(content)
-            _read_curve(parameters)
-            parameters.finish()
-            curve_known = True
-        elif label == _ENCRYPTED_LABEL:
-            return _decrypted(content, password)
-        elif label == _PKCS8_LABEL:
-            _require_no_password(password)
-            return _read_pkcs8(content)
-        elif label in _SEC1_LABELS:
-            _require_no_password(password)
-            return _read_sec1(content, curve_known=curve_known or label != "EC PRIVATE KEY")
-    raise InvalidEncoding(f"no PEM block labelled {' or '.join(_PRIVATE_LABELS)}")
-
-
-def _private_from_der(data: bytes, password: bytes | None) -> int:
+def _private_from_der(data: bytes, password: bytes | None) -> PrivateKey:
     """The three structures differ in the tags of their first two members."""
-    members = der.only_sequence(data)
-    if members.peek_tag() == der.SEQUENCE:
-        return _decrypted(data, password)
-    _require_no_password(password)
-    members.integer()
-    if members.peek_tag() == der.SEQUENCE:
-        return _read_pkcs8(data)
-    return _read_sec1(data, curve_known=False)
+    with der.reading_sequence(data) as members:
+        tags = [value[0] for value in members.rest()]
+    if tags[:1] == [der.SEQUENCE]:
+        return _read_encrypted(data)[0](password)
+    key = _read_pkcs8(data) if tags[1:2] == [der.SEQUENCE] else _read_sec1(data, curve_known=False)
+    return _unencrypted(key, password)
 
 
-def _require_no_password(password: bytes | None) -> None:
+def _unencrypted(key: PrivateKey, password: bytes | None) -> PrivateKey:
     if password is not None:
-        raise InvalidKey("a password was given, but the private key is not encrypted")
+        raise NotOpened("a password was given, but the private key is not encrypted")
+    return key
 
 
-def _read_pkcs8(data: bytes) -> int:
+def _read_pkcs8(data: bytes) -> PrivateKey:
     """OneAsymmetricKey, RFC 5958, 2; version 0 is the PrivateKeyInfo of RFC 5208."""
-    info = der.only_sequence(data)
-    version = info.integer()
-    if version not in (0, 1):
-        raise InvalidEncoding(f"PKCS#8 version {version}")
-    _read_algorithm(info)
-    key = info.octet_string()
-    if info.has_explicit(0):
-        _skip_attributes(info.implicit_set_of(0))
-    d = _read_sec1(key, curve_known=True)
-    if info.has_implicit(1):
-        if version == 0:
-            raise InvalidEncoding("a public key needs PKCS#8 version 1")
-        point = info.implicit(1)
-        if point[:1] != b"\0":
-            raise InvalidEncoding("public key is not a whole number of bytes")
-        _require_pair(d, point[1:])
-    info.finish()
-    return d
+    with der.reading_sequence(data) as info:
+        version = info.integer()
+        if version not in (0, 1):
+            raise InvalidEncoding(f"PKCS#8 version {version}")
+        _read_algorithm(info)
+        key = _read_sec1(info.octet_string(), curve_known=True)
+        if info.has_explicit(0):
+            # They say nothing about the key, but must be attributes: a type and a set of values.
+            attributes = info.implicit_set_of(0)
+            while not attributes.at_end():
+                attribute = attributes.sequence()
+                attribute.oid()
+                attribute.set_of().rest()
+        if info.has_implicit(1):
+            if version == 0:
+                raise InvalidEncoding("a public key needs PKCS#8 version 1")
+            point = info.implicit(1)
+            if point[:1] != b"\0":
+                raise InvalidEncoding("public key is not a whole number of bytes")
+            _require_pair(key, point[1:])
+    return key
 
 
-def _skip_attributes(attributes: der.Reader) -> None:
-    """They say nothing about the key (RFC 5958, 2), but must be attributes: a type and a set of values."""
-    while not attributes.at_end():
-        attribute = attributes.sequence()
-        attribute.oid()
-        values = attribute.set_of()
-        attribute.finish()
-        while not values.at_end():
-            values.checked()
-
-
-def _read_sec1(data: bytes, *, curve_known: bool) -> int:
+def _read_sec1(data: bytes, *, curve_known: bool) -> PrivateKey:
     """ECPrivateKey, RFC 5915, 3.
 
     The parameters may be missing where something else says that the curve is
     SM2's: what surrounds the key, or its public key, which fits one curve only.
     """
-    key = der.only_sequence(data)
-    version = key.integer()
-    if version != 1:
-        raise InvalidEncoding(f"ECPrivateKey version {version}")
-    octets = key.octet_string()
-    if len(octets) != 32:
-        raise InvalidEncoding(f"the private key has {len(octets)} bytes, not 32")
-    d = int.from_bytes(octets, "big")
-    if key.has_explicit(0):
-        parameters = key.explicit(0)
-        _read_curve(parameters)
-        parameters.finish()
-        curve_known = True
-    if key.has_explicit(1):
-        wrapped = key.explicit(1)
-        point = wrapped.bit_string()
-        wrapped.finish()
-        _require_pair(d, point)
-        curve_known = True
-    key.finish()
+    with der.reading_sequence(data) as members:
+        version = members.integer()
+        if version != 1:
+            raise InvalidEncoding(f"ECPrivateKey version {version}")
+        octets = members.octet_string()
+        if members.has_explicit(0):
+            _read_curve(members.explicit(0))
+            curve_known = True
+        key = PrivateKey.from_bytes(octets)
+        if members.has_explicit(1):
+            _require_pair(key, members.explicit(1).bit_string())
+            curve_known = True
     if not curve_known:
         raise InvalidEncoding("nothing says which curve the private key is of")
-    return d
+    return key
 
 
-def _require_pair(d: int, point: bytes) -> None:
-    """Does the public key, compressed or not, belong to d? Compared in constant time, as d is secret."""
-    if not 1 <= d <= SM2P256V1.n - 2:
-        raise InvalidEncoding("the private key is out of range")
-    [P] = to_affine_all([secret_sum(SM2P256V1, (d, base_comb(SM2P256V1)))], SM2P256V1)
-    expected = encode_point(P, SM2P256V1, compressed=len(point) == 33)
-    if not hmac.compare_digest(expected, point):
+def _require_pair(key: PrivateKey, point: bytes) -> None:
+    """Does the public key, compressed or not, belong to `key`?"""
+    if key.public_key.to_bytes(compressed=len(point) == 33) != point:
         raise InvalidEncoding("the public key inside is of another key, or its point does not begin with 04, 02 or 03")
 
 
@@ -251,12 +232,11 @@ def _read_algorithm(reader: der.Reader) -> None:
     if name == _EC_PUBLIC_KEY:
         _read_curve(algorithm)
     elif name != _SM2:
-        raise InvalidEncoding(f"the key's algorithm is {name}, not SM2")
+        raise ForeignKey(f"the key's algorithm is {name}, not SM2")
     elif algorithm.peek_tag() == der.NULL:
         algorithm.null()
     elif not algorithm.at_end():
         _read_curve(algorithm)
-    algorithm.finish()
 
 
 def _read_curve(reader: der.Reader) -> None:
@@ -264,9 +244,9 @@ def _read_curve(reader: der.Reader) -> None:
     if reader.peek_tag() == der.OID:
         name = reader.oid()
         if name != _SM2:
-            raise InvalidEncoding(f"the key's curve is {name}, not sm2p256v1")
+            raise ForeignKey(f"the key's curve is {name}, not sm2p256v1")
     elif reader.checked() not in _explicit_parameters():
-        raise InvalidEncoding("the key's explicit curve parameters are not those of sm2p256v1")
+        raise ForeignKey("the key's explicit curve parameters are not those of sm2p256v1")
 
 
 def _explicit_parameters() -> frozenset[bytes]:
@@ -281,27 +261,29 @@ def _explicit_parameters() -> frozenset[bytes]:
         der.sequence(*fixed, der.octet_string(encode_point(curve.G, curve, compressed=compressed)),
                      der.integer(curve.n), *cofactor)
         for compressed in (False, True)
-        for cofactor in ((), (der.integer(curve.h),))
+        for cofactor in ((), (der.integer(1),))
     )  # fmt: skip
 
 
 # --- reading encrypted keys: PBES2, RFC 8018, 6.2 ---
 
 
-def _decrypted(data: bytes, password: bytes | None) -> int:
-    """d of an EncryptedPrivateKeyInfo, RFC 5958, 3."""
-    info = der.only_sequence(data)
-    scheme = info.sequence()
-    ciphertext = info.octet_string()
-    info.finish()
-    decrypt, _ = read_pbes2(scheme, "the key")
-    if password is None:
-        raise InvalidKey("the private key is encrypted; a password is needed")
-    try:
-        return _read_pkcs8(decrypt(password, ciphertext))
-    except (InvalidEncoding, InvalidPadding):
-        # One undetailed failure: how a decryption went wrong says something about the plaintext.
-        raise InvalidKey("the password is wrong, or the key file is damaged") from None
+def _read_encrypted(data: bytes) -> tuple[Callable[[bytes | None], PrivateKey], int]:
+    """What makes a key of an EncryptedPrivateKeyInfo (RFC 5958, 3) and a password, and its work."""
+    with der.reading_sequence(data) as info:
+        decrypt, work = read_pbes2(info.sequence(), "the key")
+        ciphertext = info.octet_string()
+
+    def opened(password: bytes | None) -> PrivateKey:
+        if password is None:
+            raise NotOpened("the private key is encrypted; a password is needed")
+        try:
+            return _read_pkcs8(decrypt(password, ciphertext))
+        except (InvalidEncoding, InvalidKey, InvalidPadding):
+            # One undetailed failure: how a decryption went wrong says something about the plaintext.
+            raise NotOpened("the password is wrong, or the key file is damaged") from None
+
+    return opened, work
 
 
 def read_pbes2(scheme: der.Reader, what: str) -> tuple[Callable[[bytes, bytes], bytes], int]:
@@ -313,72 +295,61 @@ def read_pbes2(scheme: der.Reader, what: str) -> tuple[Callable[[bytes, bytes], 
     """
     name = scheme.oid()
     if name != _PBES2:
-        raise InvalidEncoding(f"{what} is encrypted by {name}; PBES2 is what is supported")
+        raise NotOpened(f"{what} is encrypted by {name}; PBES2 is what is supported")
     parameters = scheme.sequence()
-    scheme.finish()
     derivation = parameters.sequence()
-    cipher = parameters.sequence()
-    parameters.finish()
-    cipher_name = cipher.oid()
-    if cipher_name not in _CIPHERS:
-        raise InvalidEncoding(f"{what} is encrypted with cipher {cipher_name}, which is not supported")
-    algorithm, key_length, block = _CIPHERS[cipher_name]
-    iv = cipher.octet_string()
-    cipher.finish()
-    if len(iv) != block:
-        raise InvalidEncoding(f"the IV has {len(iv)} bytes, not {block}")
-    derive, work = _read_derivation(derivation, key_length)
-    return lambda password, ciphertext: _cbc_decrypt(algorithm, derive(password), iv, ciphertext), work
-
-
-def _read_derivation(algorithm: der.Reader, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
-    name = algorithm.oid()
+    name = derivation.oid()
     if name not in (_PBKDF2, _SCRYPT):
-        raise InvalidEncoding(f"the key derivation {name} is not supported")
-    parameters = algorithm.sequence()
-    algorithm.finish()
-    salt = parameters.octet_string()
+        raise NotOpened(f"the key derivation {name} is not supported")
     read = _read_pbkdf2 if name == _PBKDF2 else _read_scrypt
-    found = read(parameters, salt, key_length)
-    parameters.finish()
-    return found
+    derive, work, declared = read(derivation.sequence())
+    try:
+        cipher, iv = cbc.read_algorithm(parameters.sequence(), what)
+    except cbc.UnknownCipher as error:
+        raise NotOpened(str(error)) from None
+    key_length = cipher.key_length
+    if declared not in (None, key_length):
+        raise InvalidEncoding(f"a key of {declared} bytes is derived for a cipher that takes {key_length}")
+    return lambda password, ciphertext: cipher.unpadded(
+        cipher.decrypt(derive(password, key_length), iv, ciphertext)
+    ), work
 
 
-def _read_key_length(parameters: der.Reader, key_length: int) -> None:
-    if parameters.peek_tag() == der.INTEGER and (found := parameters.integer()) != key_length:
-        raise InvalidEncoding(f"a key of {found} bytes is derived for a cipher that takes {key_length}")
+# What derives a key from (password, its length), the work, and the key's length where the file says it.
+_Derivation: TypeAlias = "tuple[Callable[[bytes, int], bytes], int, int | None]"
 
 
-def _read_pbkdf2(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
-    """PBKDF2-params after the salt, RFC 8018, A.2. The default function, HMAC-SHA-1, is never spelt out in DER."""
-    iterations = parameters.integer()
+def _read_key_length(parameters: der.Reader) -> int | None:
+    return parameters.integer() if parameters.peek_tag() == der.INTEGER else None
+
+
+def _read_pbkdf2(parameters: der.Reader) -> _Derivation:
+    """PBKDF2-params, RFC 8018, A.2."""
+    salt, iterations = parameters.octet_string(), parameters.integer()
     if not 1 <= iterations <= MAX_ITERATIONS:
         raise InvalidKey(f"the key file asks for {iterations} PBKDF2 iterations; the limit is {MAX_ITERATIONS}")
-    _read_key_length(parameters, key_length)
-    name = _HMAC_SHA1
+    declared = _read_key_length(parameters)
+    hash_name = "sha1"
     if not parameters.at_end():
         function = parameters.sequence()
         name = function.oid()
-        if name == _HMAC_SHA1 or name not in _PRFS:
-            raise InvalidEncoding(f"the pseudorandom function {name} is not supported")
+        if name not in _PRFS:
+            raise NotOpened(f"the pseudorandom function {name} is not supported")
+        hash_name = _PRFS[name]
         if not function.at_end():
             function.null()
-        function.finish()
-    hash_name = _PRFS[name]
-    if hash_name == "sm3":
-        from smcrypto import kdf, sm3
-
-        if sm3.ENGINE == "python" and iterations > MAX_PURE_ITERATIONS:
-            raise InvalidKey(
-                f"the key file asks for {iterations} PBKDF2 iterations of SM3; without OpenSSL's SM3 the limit is"
-                f" {MAX_PURE_ITERATIONS}"
-            )
-        return lambda password: kdf.pbkdf2_hmac(password, salt, iterations, key_length), iterations
-    return lambda password: _pbkdf2(hash_name, password, salt, iterations, key_length), iterations
+    if hash_name == "sm3" and sm3.ENGINE == "python" and iterations > MAX_PURE_ITERATIONS:
+        raise InvalidKey(
+            f"the key file asks for {iterations} PBKDF2 iterations of SM3; without OpenSSL's SM3 the limit is"
+            f" {MAX_PURE_ITERATIONS}"
+        )
+    return lambda password, length: _pbkdf2(hash_name, password, salt, iterations, length), iterations, declared
 
 
 def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
-    """PBKDF2 with a hash that is not ours (names: RFC 8018, 5.2); hashlib has it only where Python has OpenSSL."""
+    """PBKDF2 (names: RFC 8018, 5.2); hashlib has it, for other hashes than ours, only where Python has OpenSSL."""
+    if hash_name == "sm3":
+        return kdf.pbkdf2_hmac(P, S, c, dkLen)
     with contextlib.suppress(AttributeError):
         return hashlib.pbkdf2_hmac(hash_name, P, S, c, dkLen)
     keyed = hmac.new(P, digestmod=hash_name)
@@ -394,10 +365,10 @@ def _pbkdf2(hash_name: str, P: bytes, S: bytes, c: int, dkLen: int) -> bytes:
     return output[:dkLen]
 
 
-def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[Callable[[bytes], bytes], int]:
-    """scrypt-params after the salt, RFC 7914, 7: N, r, p."""
-    N, r, p = parameters.integer(), parameters.integer(), parameters.integer()
-    _read_key_length(parameters, key_length)
+def _read_scrypt(parameters: der.Reader) -> _Derivation:
+    """scrypt-params, RFC 7914, 7: the salt, N, r, p."""
+    salt, N, r, p = parameters.octet_string(), parameters.integer(), parameters.integer(), parameters.integer()
+    declared = _read_key_length(parameters)
     if N < 2 or N & (N - 1) or r < 1 or p < 1 or N >> 16 * r:
         raise InvalidEncoding("scrypt's N must be a power of two above 1 and below 2^(16*r), its r and p positive")
     if 128 * max(N, p) * r > MAX_SCRYPT_MEMORY or N * r * p > MAX_SCRYPT_BLOCKS:
@@ -409,67 +380,27 @@ def _read_scrypt(parameters: der.Reader, salt: bytes, key_length: int) -> tuple[
         raise MissingDependency("the private key is encrypted under scrypt; reading it needs a Python with OpenSSL")
     # OpenSSL counts 32 * (N + p + 2) * 4 * r bytes and small change against maxmem.
     memory = 128 * r * (N + p + 2) + (1 << 16)
-    return partial(hashlib.scrypt, salt=salt, n=N, r=r, p=p, maxmem=memory, dklen=key_length), N * r * p
 
+    def derive(password: bytes, length: int) -> bytes:
+        return hashlib.scrypt(password, salt=salt, n=N, r=r, p=p, maxmem=memory, dklen=length)
 
-def _cbc_decrypt(algorithm: str, key: bytes, iv: bytes, ciphertext: bytes) -> bytes:
-    """CBC and PKCS#7 padding; InvalidPadding where that is not well formed."""
-    block = len(iv)
-    if not ciphertext or len(ciphertext) % block:
-        raise InvalidPadding("the ciphertext is not a whole number of blocks")
-    if algorithm == "SM4":
-        from smcrypto import sm4
-
-        return sm4.decrypt(key, sm4.CBC(iv), ciphertext, padding="pkcs7")
-    plain = _foreign_cbc_decrypt(algorithm, key, iv, ciphertext)
-    count = plain[-1]
-    if not 1 <= count <= block or plain[-count:] != bytes((count,)) * count:
-        raise InvalidPadding("not well-formed PKCS#7 padding")
-    return plain[:-count]
-
-
-def _foreign_cbc_decrypt(algorithm: str, key: bytes, iv: bytes, ciphertext: bytes) -> bytes:
-    """AES or 3DES, which this library does not contain, by the `cryptography` package."""
-    try:
-        from cryptography.hazmat.primitives.ciphers import Cipher, CipherAlgorithm, modes
-
-        cipher: CipherAlgorithm
-        if algorithm == "AES":
-            from cryptography.hazmat.primitives.ciphers.algorithms import AES
-
-            cipher = AES(key)
-        else:  # by this name since version 43: an older one still reads AES
-            from cryptography.hazmat.decrepit.ciphers.algorithms import TripleDES
-
-            cipher = TripleDES(key)
-    except ImportError:
-        raise MissingDependency(
-            f"the private key is encrypted with {algorithm}; reading it needs the package 'cryptography'"
-        ) from None
-    decryptor = Cipher(cipher, modes.CBC(iv)).decryptor()
-    return bytes(decryptor.update(ciphertext) + decryptor.finalize())
+    return derive, N * r * p, declared
 
 
 # --- writing ---
 
 
 def dump_private(
-    d: int,
-    public_point: bytes,
-    password: bytes | None,
-    format: Format,
-    *,
-    form: Form,
-    prf: Prf = "sm3",
+    key: PrivateKey, password: BytesLike | None, format: Format, *, form: Form, prf: Prf = "sm3",
     iterations: int = ITERATIONS,
-) -> bytes:
+) -> bytes:  # fmt: skip
     """The key pair as PKCS#8, encrypted if a password is given, or as SEC1.
 
-    public_point: 65 bytes, uncompressed. prf, iterations: of PBKDF2.
-    `"sha256"` is for OpenSSL 3.0 and 3.1, which know no HMAC-SM3 here.
-    InvalidOption for an unknown format or form, and a password with "sec1".
+    prf, iterations: of PBKDF2. `"sha256"` is for OpenSSL 3.0 and 3.1, which know no HMAC-SM3 here.
+    InvalidOption for an unknown format, and a password with "sec1".
     """
-    _require_form(form)
+    point = standard_point(key.public_key)
+    secret = None if password is None else as_bytes(password, "password")
     if format not in ("pkcs8", "sec1"):
         raise InvalidOption(f"format must be 'pkcs8' or 'sec1', not {format!r}")
     if prf not in ("sm3", "sha256"):
@@ -477,41 +408,39 @@ def dump_private(
     # RFC 5915, 3 wants both optional fields always there, inside PKCS#8 too; GmSSL refuses a key without them.
     sec1 = der.sequence(
         der.integer(1),
-        der.octet_string(d.to_bytes(32, "big")),
+        der.octet_string(key.to_bytes()),
         der.explicit(0, der.oid(_SM2)),
-        der.explicit(1, der.bit_string(public_point)),
+        der.explicit(1, der.bit_string(point)),
     )
     if format == "sec1":
-        if password is not None:
+        if secret is not None:
             raise InvalidOption("SEC1 private keys are not encrypted; use format='pkcs8' with a password")
         label, data = _SEC1_LABELS[0], sec1
     else:
-        label, data = _PKCS8_LABEL, der.sequence(der.integer(0), _algorithm(), der.octet_string(sec1))
-        if password is not None:
-            label, data = _ENCRYPTED_LABEL, _encrypted(data, password, prf, iterations)
+        label, data = _PKCS8_LABEL, der.sequence(der.integer(0), _ALGORITHM, der.octet_string(sec1))
+        if secret is not None:
+            algorithm, ciphertext = write_pbes2(data, secret, prf, iterations)
+            label, data = _ENCRYPTED_LABEL, der.sequence(algorithm, der.octet_string(ciphertext))
     return pem.encode(label, data) if form == "pem" else data
 
 
-def dump_public(point65: bytes, *, form: Form) -> bytes:
+def dump_public(key: PublicKey, *, form: Form) -> bytes:
     """SubjectPublicKeyInfo with the named curve."""
-    _require_form(form)
-    data = der.sequence(_algorithm(), der.bit_string(point65))
+    data = der.sequence(_ALGORITHM, der.bit_string(standard_point(key)))
     return pem.encode(_PUBLIC_LABEL, data) if form == "pem" else data
 
 
-def _algorithm() -> bytes:
-    return der.sequence(der.oid(_EC_PUBLIC_KEY), der.oid(_SM2))
+def standard_point(key: PublicKey) -> bytes:
+    """The point in 65 bytes; InvalidKey for one of another curve, which no structure here can say."""
+    if key.curve != SM2P256V1:
+        raise InvalidKey("key files hold keys of sm2p256v1 only")
+    return key.to_bytes()
 
 
-def _encrypted(data: bytes, password: bytes, prf: Prf, iterations: int) -> bytes:
-    algorithm, ciphertext = write_pbes2(data, password, prf, iterations)
-    return der.sequence(algorithm, der.octet_string(ciphertext))
-
-
-def write_pbes2(data: bytes, password: bytes, prf: Prf, iterations: int) -> tuple[bytes, bytes]:
-    """(AlgorithmIdentifier, ciphertext): PBES2 with SM4-CBC, fresh salt and IV. InvalidOption as of `dump_private`."""
-    from smcrypto import kdf, sm4
-
+def write_pbes2(
+    data: bytes, password: bytes, prf: Prf, iterations: int, cipher: cbc.CBC = cbc.SM4
+) -> tuple[bytes, bytes]:
+    """(AlgorithmIdentifier, ciphertext): PBES2, fresh salt and IV. InvalidOption as of `dump_private`."""
     if not password:
         raise InvalidOption("an empty password protects nothing; leave it out to write the key unencrypted")
     if prf not in ("sm3", "sha256"):
@@ -519,14 +448,8 @@ def write_pbes2(data: bytes, password: bytes, prf: Prf, iterations: int) -> tupl
     if not 1 <= iterations <= MAX_ITERATIONS:
         raise InvalidOption(f"iterations must be between 1 and {MAX_ITERATIONS}, not {iterations}")
     salt, iv = secrets.token_bytes(16), secrets.token_bytes(16)
-    if prf == "sm3":
-        # No NULL after the name: GmSSL refuses one.
-        function = der.sequence(der.oid(_HMAC_SM3))
-        key = kdf.pbkdf2_hmac(password, salt, iterations, 16)
-    else:
-        function = der.sequence(der.oid("1.2.840.113549.2.9"), der.null())
-        key = _pbkdf2("sha256", password, salt, iterations, 16)
+    # No NULL after the name of HMAC-SM3: GmSSL refuses one.
+    function = der.sequence(der.oid(_HMAC_SM3)) if prf == "sm3" else der.sequence(der.oid(_HMAC_SHA256), der.null())
     derivation = der.sequence(der.oid(_PBKDF2), der.sequence(der.octet_string(salt), der.integer(iterations), function))
-    cipher = der.sequence(der.oid(_SM4_CBC), der.octet_string(iv))
-    algorithm = der.sequence(der.oid(_PBES2), der.sequence(derivation, cipher))
-    return algorithm, sm4.encrypt(key, sm4.CBC(iv), data, padding="pkcs7")
+    algorithm = der.sequence(der.oid(_PBES2), der.sequence(derivation, cipher.algorithm(iv)))
+    return algorithm, cipher.encrypt(_pbkdf2(prf, password, salt, iterations, cipher.key_length), iv, data)

@@ -12,11 +12,11 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 from hmac import compare_digest
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 from smcrypto import sm3
 from smcrypto.errors import InvalidKey
-from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes, require_int, require_type
+from smcrypto.inputs import BytesLike, KeyHolder, as_bytes, as_exact_bytes, require_int, require_type
 from smcrypto.sm2 import encryption
 from smcrypto.sm2 import signature as signatures
 from smcrypto.sm2.curve import SM2P256V1, Curve, Point, decode_point, encode_point, require_point
@@ -28,6 +28,8 @@ __all__ = ["PrivateKey", "PublicKey"]
 
 SignatureEncoding = Literal["der", "raw"]
 CiphertextEncoding = Literal["der", "c1c3c2", "c1c2c3"]
+Format = Literal["pkcs8", "sec1"]
+Prf = Literal["sm3", "sha256"]
 
 
 class PublicKey:
@@ -71,7 +73,9 @@ class PublicKey:
 
     @classmethod
     def from_pem(cls, data: BytesLike) -> PublicKey:
-        """The key of a PEM file, label PUBLIC KEY (SubjectPublicKeyInfo, RFC 5480). InvalidKey if it is not one.
+        """The key of a PEM file, label PUBLIC KEY (SubjectPublicKeyInfo, RFC 5480); the first one of SM2.
+
+        InvalidKey: there is none, or it is malformed.
 
         >>> key = PrivateKey.generate().public_key
         >>> PublicKey.from_pem(key.to_pem()) == key
@@ -79,7 +83,7 @@ class PublicKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return cls.from_bytes(keyfiles.load_public(as_bytes(data, "data"), form="pem"))
+        return keyfiles.load_public(data, form="pem")
 
     @classmethod
     def from_der(cls, data: BytesLike) -> PublicKey:
@@ -91,7 +95,7 @@ class PublicKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return cls.from_bytes(keyfiles.load_public(as_bytes(data, "data"), form="der"))
+        return keyfiles.load_public(data, form="der")
 
     @property
     def point(self) -> Point:
@@ -120,7 +124,7 @@ class PublicKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return keyfiles.dump_public(self._standard_bytes(), form="pem")
+        return keyfiles.dump_public(self, form="pem")
 
     def to_der(self) -> bytes:
         """SubjectPublicKeyInfo as DER: 91 bytes.
@@ -130,21 +134,12 @@ class PublicKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return keyfiles.dump_public(self._standard_bytes(), form="der")
-
-    def _standard_bytes(self) -> bytes:
-        if self._curve != SM2P256V1:
-            raise InvalidKey("key files hold keys of sm2p256v1 only")
-        return self.to_bytes()
+        return keyfiles.dump_public(self, form="der")
 
     def verify(
-        self,
-        signature: BytesLike,
-        message: BytesLike,
-        *,
-        uid: BytesLike = DEFAULT_UID,
+        self, signature: BytesLike, message: BytesLike, *, uid: BytesLike = DEFAULT_UID,
         encoding: SignatureEncoding = "der",
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Return if `signature` is this key's for `message` and `uid`; else InvalidSignature (GB/T 32918.2, 7).
 
         uid: the signer's distinguishing identifier, at most 8191 bytes (InvalidLength); may be empty.
@@ -204,9 +199,8 @@ class PublicKey:
         encryption.require_encoding(encoding)
         data = as_bytes(message, "message")
         nonces = hedged_nonces(self._curve.n, b"SM2 encryption", self.to_bytes(compressed=True), sm3.digest(data))
-        return encryption.encode_ciphertext(
-            *encryption.encrypt(self._curve, self._point, data, nonces), self._curve, encoding
-        )
+        parts = encryption.encrypt(self._curve, self._point, data, nonces)
+        return encryption.encode_ciphertext(*parts, self._curve, encoding)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PublicKey):
@@ -223,7 +217,7 @@ class PublicKey:
         return PublicKey, (self._point, self._curve)
 
 
-class PrivateKey:
+class PrivateKey(KeyHolder):
     """A private key d_A: signs, decrypts, takes part in a key exchange.
 
     Made by `generate`, `from_int`, `from_bytes`, `from_pem` or `from_der`. The constructor takes d;
@@ -286,6 +280,8 @@ class PrivateKey:
     def from_pem(cls, data: BytesLike, password: BytesLike | None = None) -> PrivateKey:
         """The key of a PEM file: PKCS#8 (RFC 5958), encrypted or not, or SEC1 (RFC 5915).
 
+        Of several keys it is the first of SM2 that can be read; keys of other algorithms and encrypted ones that
+        the password does not open are passed over.
         password: bytes, for an encrypted key and only for one. InvalidKey if the file is no SM2 key, the
         password is wrong, missing or superfluous; MissingDependency if its cipher needs a package.
 
@@ -295,7 +291,7 @@ class PrivateKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return cls(keyfiles.load_private(as_bytes(data, "data"), _password(password), form="pem"))
+        return keyfiles.load_private(data, password, form="pem")
 
     @classmethod
     def from_der(cls, data: BytesLike, password: BytesLike | None = None) -> PrivateKey:
@@ -307,7 +303,7 @@ class PrivateKey:
         """
         from smcrypto.sm2 import keyfiles
 
-        return cls(keyfiles.load_private(as_bytes(data, "data"), _password(password), form="der"))
+        return keyfiles.load_private(data, password, form="der")
 
     @property
     def curve(self) -> Curve:
@@ -350,13 +346,7 @@ class PrivateKey:
         """
         return self._d.to_bytes(self._curve.scalar_bytes, "big")
 
-    def to_pem(
-        self,
-        password: BytesLike | None = None,
-        format: Literal["pkcs8", "sec1"] = "pkcs8",
-        *,
-        prf: Literal["sm3", "sha256"] = "sm3",
-    ) -> bytes:
+    def to_pem(self, password: BytesLike | None = None, format: Format = "pkcs8", *, prf: Prf = "sm3") -> bytes:
         """The key as PEM: secret unless a password encrypts it.
 
         format: "pkcs8" (RFC 5958; label PRIVATE KEY, or ENCRYPTED PRIVATE KEY with a password: PBES2 with
@@ -366,22 +356,20 @@ class PrivateKey:
         >>> PrivateKey.generate().to_pem(b"password").splitlines()[0]
         b'-----BEGIN ENCRYPTED PRIVATE KEY-----'
         """
-        return self._dump(password, format, "pem", prf)
+        from smcrypto.sm2 import keyfiles
 
-    def to_der(
-        self,
-        password: BytesLike | None = None,
-        format: Literal["pkcs8", "sec1"] = "pkcs8",
-        *,
-        prf: Literal["sm3", "sha256"] = "sm3",
-    ) -> bytes:
+        return keyfiles.dump_private(self, password, format, form="pem", prf=prf)
+
+    def to_der(self, password: BytesLike | None = None, format: Format = "pkcs8", *, prf: Prf = "sm3") -> bytes:
         """As `to_pem`, as DER.
 
         >>> key = PrivateKey.generate()
         >>> PrivateKey.from_der(key.to_der()) == key
         True
         """
-        return self._dump(password, format, "der", prf)
+        from smcrypto.sm2 import keyfiles
+
+        return keyfiles.dump_private(self, password, format, form="der", prf=prf)
 
     def to_enveloped(self, recipient: PublicKey) -> bytes:
         """The key sealed for `recipient`: SM2EnvelopedKey in DER (GM/T 0009, 7.4), as a CA hands out encryption keys.
@@ -405,19 +393,6 @@ class PrivateKey:
 
         require_type(key, PrivateKey, "key")
         return open_key(as_bytes(data, "data"), key)
-
-    def _dump(
-        self,
-        password: BytesLike | None,
-        format: Literal["pkcs8", "sec1"],
-        form: Literal["pem", "der"],
-        prf: Literal["sm3", "sha256"],
-    ) -> bytes:
-        from smcrypto.sm2 import keyfiles
-
-        return keyfiles.dump_private(
-            self._d, self.public_key._standard_bytes(), _password(password), format, form=form, prf=prf
-        )
 
     def sign(self, message: BytesLike, *, uid: BytesLike = DEFAULT_UID, encoding: SignatureEncoding = "der") -> bytes:
         """This key's signature of `message` (GB/T 32918.2, 6).
@@ -470,16 +445,3 @@ class PrivateKey:
 
     def __repr__(self) -> str:
         return f"<PrivateKey of {self.public_key!r}>"
-
-    def __copy__(self) -> PrivateKey:
-        return self
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> PrivateKey:
-        return self
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError("private keys are not pickled; to_pem(password) writes one on purpose")
-
-
-def _password(password: BytesLike | None) -> bytes | None:
-    return None if password is None else as_bytes(password, "password")

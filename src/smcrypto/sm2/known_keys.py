@@ -1,40 +1,36 @@
 """Combs for the public keys that are met again: a bounded memory of which keys those are.
 
-With a comb, verifying and encrypting take a fifth to a quarter of the time, but building
-one costs as much as several verifications: 3.5 ms for a narrow one, 10 ms for a wide one. So
-a key earns them by being used. Only what succeeded counts, so that nobody
-makes us build tables for keys that sign nothing. The least recently used go first, and only
-for a key that was used more often since than its comb costs: where more keys come than there is
-room for, in turn or at random, those that have a comb keep it, and no time goes into combs that
-are gone before they have paid. A wider comb takes nobody's place.
+With a comb, verifying and encrypting take a fifth to a quarter of the time, but building one costs as much as several
+verifications: 3.5 ms for a narrow one, 10 ms for a wide one. So a key gets one after about as many uses as it costs.
+Only uses that succeeded count, so that nobody makes us build tables for keys that sign nothing. The least recently used
+key goes first, and begins anew when it comes back: where more keys take turns than there is room for, building combs
+that are soon gone never takes more time than their keys' uses without one did. A wider comb takes nobody's place.
 """
 
 from __future__ import annotations
 
 import os
-from collections import OrderedDict, deque
+import sys
+from collections import OrderedDict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from threading import Lock
-from typing import Final, TypeAlias
+from typing import Final
 
 from smcrypto.sm2.curve import Curve, Point
 from smcrypto.sm2.points import Comb
 
 __all__ = ["KnownKeys", "known_keys"]
 
-_Key: TypeAlias = tuple[Curve, Point]
-_TAKES_A_PLACE: Final = 16  # uses since another key's last one, from which on a key's comb may take the other's place
 
-
+@dataclass(slots=True)
 class _Record:
-    """What is known of one key: its uses, when the last were, its comb, the width of the comb that was last begun."""
+    uses: int = 0
+    width: int = 0  # of the comb that was last begun
+    comb: Comb | None = None
 
-    __slots__ = ("comb", "recent", "uses", "width")
-
-    def __init__(self) -> None:
-        self.comb: Comb | None = None
-        self.recent: deque[int] = deque(maxlen=_TAKES_A_PLACE)
-        self.uses = self.width = 0
+    def points(self) -> int:
+        return 0 if self.comb is None else sum(map(len, self.comb.rows))
 
 
 class KnownKeys:
@@ -43,74 +39,50 @@ class KnownKeys:
     stages: (uses, width): from so many successful uses on, a comb of that width; ascending, one after the other.
     points: that all combs have together, 0.15 kB each. On SM2's curve a comb of width 5 has 1,664, one of width 8 has
     8,192: so 157 keys have the narrow one, or 32 the wide one, in 40 MB.
-    candidates: so many keys that have none are counted, in 1.5 kB each.
+    keys: so many are counted, in 0.5 kB each.
     """
 
     def __init__(
-        self, *, stages: Sequence[tuple[int, int]] = ((2, 5), (64, 8)), points: int = 1 << 18, candidates: int = 1024
+        self, *, stages: Sequence[tuple[int, int]] = ((5, 5), (64, 8)), points: int = 1 << 18, keys: int = 1024
     ) -> None:
-        self._stages = stages
-        self._limits = points, candidates
-        self._clock = self._points = 0  # uses of all keys; points of all combs
-        self._known: OrderedDict[_Key, _Record] = OrderedDict()
-        self._candidates: OrderedDict[_Key, _Record] = OrderedDict()
+        self._stages, self._limits = stages, (points, keys)
+        self._points = 0  # of all combs
+        self._records: OrderedDict[tuple[Curve, Point], _Record] = OrderedDict()
         self._lock = Lock()
-
-    def __len__(self) -> int:
-        """The number of keys that have a comb."""
-        return len(self._known)
 
     def comb(self, curve: Curve, P: Point) -> Comb | None:
         """P's comb if P has earned one. Who finds it due builds it; others go on without meanwhile, or with the old."""
-        key = curve, P
         with self._lock:
-            record = self._known.get(key) or self._candidates.get(key)
-            if record is None:
-                return None
-            if record.comb is not None:
-                self._known.move_to_end(key)
-            due = next((width for uses, width in self._stages if width > record.width and record.uses >= uses), 0)
-            if not due or not self._may_build(record, -(-curve.n.bit_length() // due) << due):
+            record = self._records.get((curve, P), _Record())
+            room = self._limits[0] - self._points + record.points() if record.comb else sys.maxsize
+            bits = curve.n.bit_length()
+            fits = [w for uses, w in self._stages if record.uses >= uses and -(-bits // w) << w <= room]
+            due = max(fits, default=0)
+            if due <= record.width:
                 return record.comb
             record.width = due
         comb = Comb(P, due, curve)
         with self._lock:
-            # The record in place is another where this key was put out meanwhile and earned a comb again.
-            self._points += _points(comb) - _points(self._known.get(key, record).comb)
-            record.comb = comb
-            self._candidates.pop(key, None)
-            self._known[key] = record
-            self._known.move_to_end(key)
-            while self._points > self._limits[0] and len(self._known) > 1:
-                _, oldest = self._known.popitem(last=False)
-                self._points -= _points(oldest.comb)
-                oldest.comb = None  # a thread may be building it a wider one at this moment
+            if self._records.get((curve, P)) is record:  # it may have gone meanwhile
+                self._points -= record.points()
+                record.comb = comb
+                self._points += record.points()
+                self._records.move_to_end((curve, P))
+                self._shrink()
         return comb
-
-    def _may_build(self, record: _Record, points: int) -> bool:
-        """Whether there is room, or (for a first comb) this key was used often since some key with a comb last was."""
-        if not self._known or self._points + points <= self._limits[0]:
-            return True
-        oldest = next(iter(self._known.values()))
-        return record.comb is None and len(record.recent) == _TAKES_A_PLACE and record.recent[0] > oldest.recent[-1]
 
     def used(self, curve: Curve, P: Point) -> None:
         """Count one use of P that succeeded."""
-        key = curve, P
         with self._lock:
-            record = self._known.get(key)
-            if record is None:
-                record = self._candidates.setdefault(key, _Record())
-                self._candidates.move_to_end(key)
-                if len(self._candidates) > self._limits[1]:
-                    self._candidates.popitem(last=False)
+            record = self._records.setdefault((curve, P), _Record())
+            self._records.move_to_end((curve, P))
             record.uses += 1
-            self._clock += 1
-            record.recent.append(self._clock)
+            self._shrink()
 
-
-def _points(comb: Comb | None) -> int:
-    return 0 if comb is None else sum(map(len, comb.rows))
+    def _shrink(self) -> None:
+        points, keys = self._limits
+        while len(self._records) > keys or self._points > points:
+            self._points -= self._records.popitem(last=False)[1].points()
 
 
 known_keys: Final = KnownKeys()

@@ -26,18 +26,23 @@ whose w-bit windows are b_0 ... b_(m-1),
 so window i of k' indexes a table of the odd multiples from -(2^w - 1) to 2^w - 1.
 
 All points here are of prime order n > 4 (`curve.require_point`).
+
+Where the package `gmpy2` is installed (extra `fast`), its integers, GMP's, take the place of Python's once the process
+has computed some dozens of sums: see `_calculating`. A product and its reduction take a third of the time then.
 """
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Final, TypeAlias
 
+from smcrypto.optional import OptionalEngine
 from smcrypto.sm2.curve import Curve, Point
 
-__all__ = ["Comb", "Extended", "base_comb", "public_sum", "secret_sum", "to_affine", "to_affine_all"]
+__all__ = ["ENGINE", "Comb", "Extended", "base_comb", "public_sum", "secret_sum", "to_affine", "to_affine_all"]
 
 Jacobian: TypeAlias = tuple[int, int, int]
 Extended: TypeAlias = tuple[int, int, int, int]
@@ -49,6 +54,29 @@ _INFINITY: Final[Jacobian] = (0, 1, 0)
 _SECRET_WINDOW: Final = 5
 _NAF_WINDOW: Final = 5
 _BASE_WINDOW: Final = 9
+
+
+def _load() -> Callable[[int], int] | None:
+    try:
+        from gmpy2 import mpz
+    except ImportError:
+        return None
+    number: Callable[[int], int] = mpz
+    return number
+
+
+ENGINE: Final = OptionalEngine("gmpy2", _load, 64)  # sums: the import takes 33 ms, and each saves some 0.5
+
+
+@lru_cache(maxsize=8)
+def _converted(curve: Curve, number: Callable[[int], int]) -> Curve:
+    return replace(curve, p=number(curve.p), a=number(curve.a))
+
+
+def _calculating(curve: Curve) -> Curve:
+    """The same curve, its p and a of the engine's integers: whatever is reduced modulo this p becomes one as well."""
+    number = ENGINE.after(1)
+    return curve if number is None else _converted(curve, number)
 
 
 def walk(P: Jacobian, steps: Iterable[tuple[int, Sequence[Point]]], curve: Curve) -> Jacobian:
@@ -149,12 +177,12 @@ def inverses(values: Sequence[int], p: int) -> list[int]:
 
 
 def to_affine_all(points: Sequence[Extended], curve: Curve) -> list[Point]:
-    """The affine form of finite points, with one inversion for all."""
+    """The affine form of finite points, in Python's integers, with one inversion for all."""
     p = curve.p
     result = []
     for (X, Y, ZZ, _), cube in zip(points, inverses([P[3] for P in points], p), strict=True):
         z = ZZ * cube % p  # 1/Z
-        result.append((X * (z * z % p) % p, Y * cube % p))
+        result.append((int(X * (z * z % p) % p), int(Y * cube % p)))
     return result
 
 
@@ -244,6 +272,7 @@ class Comb:
 
     def __init__(self, P: Point, width: int, curve: Curve) -> None:
         self.curve = curve
+        curve = _calculating(curve)
         self.width = width = _window_bits(width, curve)
         count = -(-curve.n.bit_length() // width)
         chain: list[Jacobian] = [(*P, 1)]
@@ -278,6 +307,7 @@ def base_comb(curve: Curve) -> Comb:
 
 def secret_sum(curve: Curve, *terms: tuple[int, Point | Comb]) -> Extended:
     """The sum of [k]P over the terms (k, P or P's comb), 0 <= k < n, in steps that do not depend on any k."""
+    curve = _calculating(curve)
     width = _window_bits(_SECRET_WINDOW, curve)
     combed: list[Point] = []
     walked: list[list[Point]] = []
@@ -304,6 +334,7 @@ def _randomised(P: Point, curve: Curve) -> Jacobian:
 
 def public_sum(curve: Curve, *terms: tuple[int, Point | Comb]) -> Extended:
     """The same sum for public scalars: its steps depend on them. At most one term without a comb."""
+    curve = _calculating(curve)
     combed: list[Point] = []
     start = _INFINITY
     for k, P in terms:

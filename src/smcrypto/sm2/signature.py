@@ -90,11 +90,8 @@ def decode_signature(signature: bytes, curve: Curve, encoding: str) -> tuple[int
             raise InvalidSignature(REFUSED)
         return int.from_bytes(signature[:size], "big"), int.from_bytes(signature[size:], "big")
     try:
-        whole = der.Reader(signature)
-        body = whole.sequence()
-        whole.finish()
-        r, s = body.integer(), body.integer()
-        body.finish()
+        with der.reading_sequence(signature) as body:
+            r, s = body.integer(), body.integer()
     except InvalidEncoding:
         raise InvalidSignature(REFUSED) from None
     return r, s

@@ -5,31 +5,17 @@ and `Cipher` with `ECB`, `CBC`, `CFB`, `OFB`, `CTR`, `XTS` are for formats that
 already exist; `Cipher` with `GCM` for what does not fit in memory. `cmac` and
 `cbc_mac` authenticate. `SM4` is the bare block.
 
-`ENGINE` says what computes what is serial (CBC, CFB and OFB encryption, single blocks, CBC-MAC, and `SM4GCM`):
-"cryptography" where that package is installed, else "python", as under SMCRYPTO_PURE=1. All the rest is Python here.
+`ENGINE` says what computes: "cryptography" where that package is installed, else "python", as under SMCRYPTO_PURE=1.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smcrypto.sm4 import serial
 from smcrypto.sm4.cipher import SM4
+from smcrypto.sm4.foreign import ENGINE as _ENGINE
 from smcrypto.sm4.mac import cbc_mac, cmac
-from smcrypto.sm4.modes import (
-    CBC,
-    CFB,
-    CTR,
-    ECB,
-    GCM,
-    OFB,
-    XTS,
-    Cipher,
-    CipherStream,
-    Mode,
-    decrypt,
-    encrypt,
-)
+from smcrypto.sm4.modes import CBC, CFB, CTR, ECB, GCM, OFB, XTS, Cipher, CipherStream, Mode, decrypt, encrypt
 
 if TYPE_CHECKING:
     from smcrypto.sm4.aead import SM4CCM, SM4GCM
@@ -37,31 +23,15 @@ if TYPE_CHECKING:
     ENGINE: str
 
 __all__ = [
-    "CBC",
-    "CFB",
-    "CTR",
-    "ECB",
-    "ENGINE",
-    "GCM",
-    "OFB",
-    "SM4",
-    "SM4CCM",
-    "SM4GCM",
-    "XTS",
-    "Cipher",
-    "CipherStream",
-    "Mode",
-    "cbc_mac",
-    "cmac",
-    "decrypt",
-    "encrypt",
-]
+    "CBC", "CFB", "CTR", "ECB", "ENGINE", "GCM", "OFB", "SM4", "SM4CCM", "SM4GCM", "XTS", "Cipher", "CipherStream",
+    "Mode", "cbc_mac", "cmac", "decrypt", "encrypt",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> type | str:
     """SM4GCM and SM4CCM arrive with their first use: most programs want either a mode or an AEAD. ENGINE may change."""
     if name == "ENGINE":
-        return serial.ENGINE
+        return _ENGINE.name
     if name in ("SM4CCM", "SM4GCM"):
         from smcrypto.sm4 import aead
 

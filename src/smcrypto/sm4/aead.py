@@ -13,12 +13,12 @@ from __future__ import annotations
 from hmac import compare_digest
 
 from smcrypto.errors import InvalidLength, InvalidTag
-from smcrypto.inputs import BytesLike, as_bytes, require_int
-from smcrypto.sm4 import serial
+from smcrypto.inputs import BytesLike, KeyHolder, as_bytes, require_int
 from smcrypto.sm4.engine import Engine, xor_bytes
+from smcrypto.sm4.foreign import ENGINE
 from smcrypto.sm4.ghash import GHASH
 
-__all__ = ["SM4CCM", "SM4GCM"]
+__all__ = ["SM4CCM", "SM4GCM", "inc32", "require_gcm_text"]
 
 _ZERO = bytes(16)
 _ONE = b"\0\0\0\1"
@@ -34,7 +34,7 @@ def _checked_tag_length(tag_length: int, allowed: tuple[int, ...]) -> int:
     return tag_length
 
 
-class SM4GCM:
+class SM4GCM(KeyHolder):
     """SM4 in Galois/Counter Mode: NIST SP 800-38D with the block cipher of GB/T 32907; RFC 8998.
 
     key: 16 bytes, otherwise InvalidKey. tag_length: 12 to 16 bytes, otherwise InvalidLength; shorter tags are for
@@ -68,17 +68,15 @@ class SM4GCM:
         """
         nonce, data, A = as_bytes(nonce, "nonce"), as_bytes(data, "data"), as_bytes(associated_data, "associated_data")
         _check_gcm_lengths(len(nonce), len(data), len(A))
-        if len(nonce) == 12 and (foreign := serial.gcm(len(data))) is not None:
-            sealed = foreign.seal(self._key, nonce, A, data)
-            return sealed if self._t == 16 else sealed[: self._t - 16]
-        if self._ghash is None and len(nonce) == 12:  # the key's first message: E(K, 0^128) rides along
-            J_0 = nonce + _ONE
-            masks, C = self._engine.encrypt_and_ctr_xor(_ZERO + J_0, _inc32(J_0), data, 32)
-            self._ghash = GHASH(masks[:16])
-            return C + self._tag(masks[16:], A, C)
+        if len(nonce) == 12 and (foreign := ENGINE.after(len(data) // 16 + 2)) is not None:
+            seal, tag = foreign.sealing(self._key, nonce, A)
+            return seal(data) + tag()[: self._t]
         J_0 = self._J_0(nonce)
-        mask, C = self._engine.encrypt_and_ctr_xor(J_0, _inc32(J_0), data, 32)
-        return C + self._tag(mask, A, C)
+        zero = _ZERO if self._ghash is None else b""  # with the key's first message E(K, 0^128) is computed as well
+        masks, C = self._engine.encrypt_and_ctr_xor(zero + J_0, inc32(J_0), data, 32)
+        if zero:
+            self._ghash = GHASH(masks[:16])
+        return C + self._tag(masks[-16:], A, C)
 
     def decrypt(self, nonce: BytesLike, data: BytesLike, associated_data: BytesLike = b"") -> bytes:
         """The plaintext of `data` = ciphertext ‖ tag; InvalidTag unless all three are as they were sealed.
@@ -91,16 +89,17 @@ class SM4GCM:
         if len(data) < self._t:
             raise InvalidTag("the message is not authentic")
         C, T = data[: -self._t], data[-self._t :]
-        if len(nonce) == 12 and (foreign := serial.gcm(len(C))) is not None:
-            P = foreign.open(self._key, nonce, A, C, T)
-            if P is None:
+        if len(nonce) == 12 and (foreign := ENGINE.after(len(C) // 16 + 2)) is not None:
+            opened, holds = foreign.opening(self._key, nonce, A)
+            P = opened(C)
+            if not holds(T):
                 raise InvalidTag("the message is not authentic")
             return P
         J_0 = self._J_0(nonce)
         if len(C) > _ONE_PASS:
             self._check(self._engine.encrypt(J_0), A, C, T)
-            return self._engine.ctr_xor(_inc32(J_0), C, 32)
-        mask, stream = self._engine.encrypt_and_ctr_xor(J_0, _inc32(J_0), bytes(len(C)), 32)
+            return self._engine.ctr_xor(inc32(J_0), C, 32)
+        mask, stream = self._engine.encrypt_and_ctr_xor(J_0, inc32(J_0), bytes(len(C)), 32)
         self._check(mask, A, C, T)
         return xor_bytes(stream, C)
 
@@ -109,11 +108,14 @@ class SM4GCM:
 
     def _hash(self, A: bytes, C: bytes) -> int:
         """GHASH_H(A ‖ pad ‖ C ‖ pad ‖ len(A) ‖ len(C)): steps 4 and 5 of 7.1."""
-        ghash = self._ghash
-        if ghash is None:
-            ghash = self._ghash = GHASH(self._engine.encrypt(_ZERO))
         lengths = (len(A) << 67 | len(C) << 3).to_bytes(16, "big")
-        return ghash(b"".join((A, bytes(-len(A) % 16), C, bytes(-len(C) % 16), lengths)))
+        return self._hashing()(b"".join((A, bytes(-len(A) % 16), C, bytes(-len(C) % 16), lengths)))
+
+    def _hashing(self) -> GHASH:
+        """GHASH under H = E(K, 0^128)."""
+        if self._ghash is None:
+            self._ghash = GHASH(self._engine.encrypt(_ZERO))
+        return self._ghash
 
     def _J_0(self, nonce: bytes) -> bytes:
         """The pre-counter block: step 2 of 7.1."""
@@ -130,7 +132,7 @@ class SM4GCM:
         return (self._hash(A, C) ^ int.from_bytes(mask, "big")).to_bytes(16, "big")[: self._t]
 
 
-def _inc32(block: bytes) -> bytes:
+def inc32(block: bytes) -> bytes:
     """The block with its low 32 bits incremented modulo 2^32: 6.2."""
     return block[:12] + (int.from_bytes(block[12:], "big") + 1 & 0xFFFFFFFF).to_bytes(4, "big")
 
@@ -138,13 +140,19 @@ def _inc32(block: bytes) -> bytes:
 def _check_gcm_lengths(nonce: int, text: int, A: int) -> None:
     if not 1 <= nonce <= _GCM_BYTES:
         raise InvalidLength("nonce must be 1 byte or more")
-    if text > GCM_TEXT:
-        raise InvalidLength(f"GCM takes at most 2^36 - 32 bytes (SP 800-38D, 5.2.1.1), not {text}")
+    require_gcm_text(text)
     if A > _GCM_BYTES:
         raise InvalidLength("associated_data must be below 2^61 bytes (SP 800-38D, 5.2.1.1)")
 
 
-class SM4CCM:
+def require_gcm_text(length: int) -> int:
+    """`length` again, of plaintext in bytes, unless it is beyond the standard's: then InvalidLength."""
+    if length > GCM_TEXT:
+        raise InvalidLength(f"GCM takes at most 2^36 - 32 bytes (SP 800-38D, 5.2.1.1), not {length}")
+    return length
+
+
+class SM4CCM(KeyHolder):
     """SM4 in CCM mode: NIST SP 800-38C (RFC 3610) with the block cipher of GB/T 32907; RFC 8998.
 
     key: 16 bytes, otherwise InvalidKey. tag_length: 4, 6, 8, 10, 12, 14 or 16 bytes, otherwise InvalidLength.

@@ -25,17 +25,9 @@ from operator import rshift, xor
 from typing import Any
 
 __all__ = [
-    "SBOX_CIRCUIT",
-    "chunk_width",
-    "compiled_sbox",
-    "counter_planes",
-    "crypt_planes",
-    "crypt_xor",
-    "ctr_xor",
-    "key_planes",
-    "rows_from_bytes",
-    "transpose",
-]
+    "SBOX_CIRCUIT", "chunk_width", "compiled_sbox", "counter_planes", "crypt_planes", "crypt_xor", "ctr_xor",
+    "key_planes", "rows_from_bytes", "transpose",
+]  # fmt: skip
 
 # S(x) = circuit(x ^ 0x75) ^ 0xD3; x0 and o0 are the bits of weight 1.
 #

@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NoReturn, Protocol, TypeAlias
 
-from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding
-from smcrypto.inputs import BytesLike, as_bytes, as_exact_bytes, require_int
+from smcrypto.errors import AlreadyFinalized, InvalidKey, InvalidLength, InvalidOption, InvalidPadding, OutOfOrder
+from smcrypto.inputs import BytesLike, KeyHolder, as_bytes, as_exact_bytes, require_int
 from smcrypto.sm4.engine import Engine, xor_bytes
-from smcrypto.sm4.xts import Variant, XTSStream, check_variant
+from smcrypto.sm4.xts import Variant, XTSStream
 
 __all__ = [
     "CBC", "CFB", "CTR", "ECB", "GCM", "OFB", "XTS", "Cipher", "CipherStream", "Mode", "Padding", "decrypt", "encrypt",
@@ -34,36 +34,32 @@ class ECB:
 
 
 @dataclass(frozen=True, slots=True, init=False)
-class CBC:
-    """Cipher block chaining. iv: 16 bytes, unpredictable and never used twice with one key; otherwise InvalidLength."""
-
+class _WithIV:
     iv: bytes
 
     def __init__(self, iv: BytesLike) -> None:
         object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
 
 
-@dataclass(frozen=True, slots=True, init=False)
-class CFB:
+class CBC(_WithIV):
+    """Cipher block chaining. iv: 16 bytes, unpredictable and never used twice with one key; otherwise InvalidLength."""
+
+    __slots__ = ()
+
+
+class CFB(_WithIV):
     """Cipher feedback over whole blocks (CFB-128).
 
     iv: 16 bytes, never used twice with one key; otherwise InvalidLength.
     """
 
-    iv: bytes
-
-    def __init__(self, iv: BytesLike) -> None:
-        object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
+    __slots__ = ()
 
 
-@dataclass(frozen=True, slots=True, init=False)
-class OFB:
+class OFB(_WithIV):
     """Output feedback. iv: 16 bytes, never used twice with one key; otherwise InvalidLength."""
 
-    iv: bytes
-
-    def __init__(self, iv: BytesLike) -> None:
-        object.__setattr__(self, "iv", as_exact_bytes(iv, "iv", 16))
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -94,7 +90,9 @@ class XTS:
 
     def __init__(self, tweak: BytesLike, variant: Variant = "gb") -> None:
         object.__setattr__(self, "tweak", as_exact_bytes(tweak, "tweak", 16))
-        object.__setattr__(self, "variant", check_variant(variant))
+        if variant not in ("gb", "ieee"):
+            raise InvalidOption('variant must be "gb" or "ieee"')
+        object.__setattr__(self, "variant", variant)
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -102,12 +100,14 @@ class GCM:
     """Galois/Counter Mode for a message in pieces; the ciphertext ends with the tag, as `SM4GCM` has it.
 
     nonce: 1 byte or more, 12 are usual, never used twice with one key. associated_data: authenticated, not
-    contained. tag_length: 12 to 16. InvalidLength otherwise.
+    contained. tag_length: 12 to 16. InvalidLength otherwise. One object serves one encryption, the second is
+    OutOfOrder, and any number of decryptions.
     """
 
     nonce: bytes
     associated_data: bytes = b""
     tag_length: int = 16
+    _unused: list[bool] = field(init=False, repr=False, compare=False)
 
     def __init__(self, nonce: BytesLike, associated_data: BytesLike = b"", tag_length: int = 16) -> None:
         octets = as_bytes(nonce, "nonce")
@@ -118,6 +118,18 @@ class GCM:
         object.__setattr__(self, "nonce", octets)
         object.__setattr__(self, "associated_data", as_bytes(associated_data, "associated_data"))
         object.__setattr__(self, "tag_length", tag_length)
+        object.__setattr__(self, "_unused", [True])
+
+    def __deepcopy__(self, memo: object) -> GCM:
+        """Itself: a copy with a record of its own would encrypt with the nonce once more."""
+        return self
+
+    def _take(self) -> None:
+        """For an encryption: once. (A list's pop is one step, whatever the threads.)"""
+        try:
+            self._unused.pop()
+        except IndexError:
+            raise OutOfOrder("this GCM object has encrypted; take a new one, with another nonce") from None
 
 
 Mode: TypeAlias = ECB | CBC | CFB | OFB | CTR | XTS | GCM
@@ -179,26 +191,50 @@ def _ctr(engine: Engine, chain: bytes, data: bytes, whole: int) -> tuple[bytes, 
 
 
 class _WholeBlocks:
-    """ECB and CBC: keeps an incomplete block back, refuses one at the end."""
+    """ECB and CBC: keeps an incomplete block back, and the last one where it ends in padding to be removed."""
 
-    def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
+    def __init__(self, engine: Engine, step: _Step, chain: bytes, padding: Padding, *, encrypting: bool) -> None:
         self._engine, self._step, self._chain = engine, step, chain
+        self._padding, self._encrypting = padding, encrypting
         self._pending = b""
 
     def update(self, data: bytes) -> bytes:
         data = self._pending + data
-        whole = len(data) & ~15
+        held = self._padding is not None and not self._encrypting
+        whole = max(0, len(data) - held) & ~15
         self._pending = data[whole:]
-        out, self._chain = self._step(self._engine, self._chain, data[:whole], whole)
+        return self._crypt(data[:whole])
+
+    def _crypt(self, blocks: bytes) -> bytes:
+        out, self._chain = self._step(self._engine, self._chain, blocks, len(blocks))
         return out
 
     def finalize(self) -> bytes:
-        if self._pending:
-            raise InvalidLength("without padding the data must be a multiple of 16 bytes")
-        return b""
+        last, padding = self._pending, self._padding
+        if padding is None:
+            if last:
+                raise InvalidLength("without padding the data must be a multiple of 16 bytes")
+            return b""
+        if self._encrypting:
+            return self._crypt(last + _ending(padding, 16 - len(last)))
+        if len(last) % 16 or (not last and padding != "zeros"):
+            raise InvalidPadding("the padding is malformed")
+        last = self._crypt(last)
+        if padding == "zeros":
+            return last.rstrip(b"\0")
+        return remove_pkcs7(last) if padding == "pkcs7" else remove_iso7816(last)
 
 
-class _AnyLength:
+def _ending(padding: str, count: int) -> bytes:
+    """What fills up a block in which `count` bytes are left; 16 where the data ends with a block."""
+    if padding == "pkcs7":  # RFC 5652, 6.3: 1 to 16 bytes, each saying how many
+        return bytes([count]) * count
+    if padding == "iso7816":  # ISO/IEC 7816-4; method 2 of GB/T 15852.1
+        return b"\x80" + bytes(count - 1)
+    return bytes(count % 16)
+
+
+class AnyLength:
     """CFB, OFB and CTR: out = in XOR mask. A block that was begun is done again, whole, once the rest has come."""
 
     def __init__(self, engine: Engine, step: _Step, chain: bytes) -> None:
@@ -219,49 +255,6 @@ class _AnyLength:
 
     def finalize(self) -> bytes:
         return b""
-
-
-class _Pad:
-    """Padding in front of a block mode."""
-
-    def __init__(self, inner: _Transform, padding: str) -> None:
-        self._inner, self._padding, self._length = inner, padding, 0
-
-    def update(self, data: bytes) -> bytes:
-        self._length += len(data)
-        return self._inner.update(data)
-
-    def finalize(self) -> bytes:
-        count = 16 - self._length % 16
-        match self._padding:
-            case "pkcs7":  # RFC 5652, 6.3: 1 to 16 bytes, each saying how many
-                ending = bytes([count]) * count
-            case "iso7816":  # ISO/IEC 7816-4; method 2 of GB/T 15852.1
-                ending = b"\x80" + bytes(count - 1)
-            case _:  # as few zeros as fill the block, none where it is full
-                ending = bytes(count % 16)
-        return self._inner.update(ending) + self._inner.finalize()
-
-
-class _Unpad:
-    """The inverse of `_Pad`: holds the last block back until the end is known."""
-
-    def __init__(self, inner: _Transform, padding: str) -> None:
-        self._inner, self._padding, self._length, self._held = inner, padding, 0, b""
-
-    def update(self, data: bytes) -> bytes:
-        self._length += len(data)
-        plain = self._held + self._inner.update(data)
-        ready = max(0, len(plain) - 16)
-        self._held = plain[ready:]
-        return plain[:ready]
-
-    def finalize(self) -> bytes:
-        if self._length % 16 or (self._length == 0 and self._padding != "zeros"):
-            raise InvalidPadding("the padding is malformed")
-        if self._padding == "zeros":
-            return self._held.rstrip(b"\0")
-        return remove_pkcs7(self._held) if self._padding == "pkcs7" else remove_iso7816(self._held)
 
 
 def remove_pkcs7(block: bytes) -> bytes:
@@ -321,7 +314,7 @@ class CipherStream:
 
 
 @dataclass(frozen=True, slots=True, init=False)
-class Cipher:
+class Cipher(KeyHolder):
     """A key joined with a mode, GB/T 17964-2021.
 
     key: 16 bytes, for XTS 32; otherwise InvalidKey.
@@ -373,26 +366,26 @@ class Cipher:
 def _transform(cipher: Cipher, *, encrypting: bool, early: bool = False) -> _Transform:
     mode = cipher.mode
     if isinstance(mode, GCM):
-        from smcrypto.sm4.gcmstream import GCMDecryption, GCMEncryption
+        from smcrypto.sm4.gcmstream import EarlyGCMDecryption, GCMDecryption, GCMEncryption
 
-        what = cipher.key, mode.nonce, mode.associated_data, mode.tag_length
-        return GCMEncryption(*what) if encrypting else GCMDecryption(*what, early=early)
+        if encrypting:
+            mode._take()
+        stream = GCMEncryption if encrypting else EarlyGCMDecryption if early else GCMDecryption
+        return stream(cipher.key, mode.nonce, mode.associated_data, mode.tag_length)
     if isinstance(mode, XTS):
         return XTSStream(cipher.key, mode.tweak, mode.variant, encrypting=encrypting)
     engine = Engine(cipher.key)
     if isinstance(mode, CTR):
-        return _AnyLength(engine, _ctr, mode.nonce)
+        return AnyLength(engine, _ctr, mode.nonce)
     if isinstance(mode, OFB):
-        return _AnyLength(engine, _ofb, mode.iv)
+        return AnyLength(engine, _ofb, mode.iv)
     if isinstance(mode, CFB):
-        return _AnyLength(engine, _cfb_encrypt if encrypting else _cfb_decrypt, mode.iv)
+        return AnyLength(engine, _cfb_encrypt if encrypting else _cfb_decrypt, mode.iv)
     if isinstance(mode, ECB):
-        inner = _WholeBlocks(engine, _ecb_encrypt if encrypting else _ecb_decrypt, b"")
+        step, chain = _ecb_encrypt if encrypting else _ecb_decrypt, b""
     else:
-        inner = _WholeBlocks(engine, _cbc_encrypt if encrypting else _cbc_decrypt, mode.iv)
-    if cipher.padding is None:
-        return inner
-    return _Pad(inner, cipher.padding) if encrypting else _Unpad(inner, cipher.padding)
+        step, chain = _cbc_encrypt if encrypting else _cbc_decrypt, mode.iv
+    return _WholeBlocks(engine, step, chain, cipher.padding, encrypting=encrypting)
 
 
 def encrypt(key: BytesLike, mode: Mode, data: BytesLike, *, padding: Padding = None) -> bytes:

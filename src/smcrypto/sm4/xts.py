@@ -15,22 +15,15 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Literal, TypeAlias
 
-from smcrypto.errors import InvalidLength, InvalidOption
+from smcrypto.errors import InvalidLength
 from smcrypto.sm4.engine import Engine, xor_bytes
 
-__all__ = ["Variant", "XTSStream", "check_variant", "tweak_sequence"]
+__all__ = ["Variant", "XTSStream", "tweak_sequence"]
 
 Variant: TypeAlias = Literal["gb", "ieee"]
 
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _LANES = 64  # tweaks computed at once; alpha^64 is the largest power that _times_alpha takes
-
-
-def check_variant(variant: Variant) -> Variant:
-    """`variant` itself; InvalidOption unless it is one of the two."""
-    if variant not in ("gb", "ieee"):
-        raise InvalidOption('variant must be "gb" or "ieee"')
-    return variant
 
 
 @cache

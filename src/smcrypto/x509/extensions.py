@@ -7,28 +7,20 @@ that one which cannot be read is refused at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Final
 
-from smcrypto import der, sm3
+from smcrypto import der, sm2, sm3
 from smcrypto.errors import CertificateError, InvalidOption
 from smcrypto.inputs import as_bytes, require_int, require_type
 from smcrypto.x509.names import Name, written_oid
 
 __all__ = [
-    "AUTHORITY_KEY_IDENTIFIER",
-    "BASIC_CONSTRAINTS",
-    "EXTENDED_KEY_USAGE",
-    "KEY_USAGE",
-    "SUBJECT_ALT_NAME",
-    "SUBJECT_KEY_IDENTIFIER",
-    "AuthorityKeyIdentifier",
-    "BasicConstraints",
-    "Extension",
-    "usage_oid",
-]
+    "AUTHORITY_KEY_IDENTIFIER", "BASIC_CONSTRAINTS", "EXTENDED_KEY_USAGE", "KEY_USAGE", "SUBJECT_ALT_NAME",
+    "SUBJECT_KEY_IDENTIFIER", "AuthorityKeyIdentifier", "BasicConstraints", "Extension", "usage_oid",
+]  # fmt: skip
 
 SUBJECT_KEY_IDENTIFIER: Final = "2.5.29.14"
 KEY_USAGE: Final = "2.5.29.15"
@@ -37,6 +29,7 @@ BASIC_CONSTRAINTS: Final = "2.5.29.19"
 CRL_NUMBER: Final = "2.5.29.20"
 REASON_CODE: Final = "2.5.29.21"
 NAME_CONSTRAINTS: Final = "2.5.29.30"
+CERTIFICATE_POLICIES: Final = "2.5.29.32"
 AUTHORITY_KEY_IDENTIFIER: Final = "2.5.29.35"
 EXTENDED_KEY_USAGE: Final = "2.5.29.37"
 
@@ -45,7 +38,6 @@ _KEY_USAGES: Final = (
     "digitalSignature", "nonRepudiation", "keyEncipherment", "dataEncipherment", "keyAgreement", "keyCertSign",
     "cRLSign", "encipherOnly", "decipherOnly",
 )  # fmt: skip
-_KEY_USAGE_BITS: Final = {name: bit for bit, name in enumerate(_KEY_USAGES)} | {"contentCommitment": 1}
 
 # Key purposes, 4.2.1.12.
 _PURPOSES: Final = {
@@ -113,53 +105,48 @@ class AuthorityKeyIdentifier:
 
 
 def read_extensions(reader: der.Reader) -> tuple[Extension, ...]:
-    """Extensions, 4.1 and 4.2: at least one, no two of the same kind."""
-    sequence = reader.sequence()
-    found: dict[str, Extension] = {}
-    while not sequence.at_end():
-        one = sequence.sequence()
-        oid = one.oid()
-        critical = False
-        if one.peek_tag() == der.BOOLEAN:
-            critical = one.boolean()
-            if not critical:
-                raise CertificateError(f"extension {oid} spells out its default (X.690, 11.5)")
-        value = one.octet_string()
-        one.finish()
-        if oid in found:
-            raise CertificateError(f"extension {oid} occurs twice")
-        found[oid] = Extension(oid, critical, value)
-    if not found:
-        raise CertificateError("the list of extensions is empty")
-    return tuple(found.values())
+    """Extensions, 4.1 and 4.2: no two of the same kind."""
+    found = reader.sequence().each(lambda one: _read_extension(one.sequence()))
+    require_distinct(found)
+    return tuple(found)
 
 
-def read_optional(body: der.Reader, number: int) -> tuple[Extension, ...]:
-    """The extensions under the explicit tag [number], none where that is absent."""
-    if not body.has_explicit(number):
-        return ()
-    wrapped = body.explicit(number)
-    extensions = read_extensions(wrapped)
-    wrapped.finish()
-    return extensions
+def _read_extension(one: der.Reader) -> Extension:
+    return Extension(one.oid(), one.peek_tag() == der.BOOLEAN and one.boolean(), one.octet_string())
+
+
+def require_distinct(extensions: Collection[Extension]) -> None:
+    """CertificateError where two are of the same kind (4.2)."""
+    if len({extension.oid for extension in extensions}) != len(extensions):
+        raise CertificateError("an extension occurs twice")
+
+
+def oddities(extensions: tuple[Extension, ...], encoded: bytes) -> Iterator[str]:
+    """What in `extensions`, read from `encoded`, a CA may not write, though what it means is plain."""
+    if not extensions:
+        yield "the list of extensions is empty (RFC 5280, 4.1)"
+    if encoded != der.sequence(*(extension.to_der() for extension in extensions)):
+        yield "an extension spells out that it is not critical (X.690, 11.5)"
+    for extension in extensions:
+        if extension.oid == BASIC_CONSTRAINTS:
+            constraints = read_basic_constraints(extension.value)
+            if constraints.path_length is not None and not constraints.ca:
+                yield "basicConstraints has a path length, but not for a CA (RFC 5280, 4.2.1.9)"
+            if extension.value[2:5] == der.boolean(False):
+                yield "basicConstraints spells out its default (X.690, 11.5)"
+        if extension.oid == KEY_USAGE and extension.value != key_usage(read_key_usage(extension.value)).value:
+            yield "keyUsage ends in zero bits (X.690, 11.2.2)"
+        if extension.oid == CERTIFICATE_POLICIES and extension.critical:
+            yield "certificatePolicies is critical, and policies are not judged (RFC 5280, 4.2.1.4)"
 
 
 # --- one function to read and one to write each extension ---
 
 
 def read_basic_constraints(value: bytes) -> BasicConstraints:
-    sequence = der.only_sequence(value)
-    ca, path_length = False, None
-    if sequence.peek_tag() == der.BOOLEAN:
-        ca = sequence.boolean()
-        if not ca:
-            raise CertificateError("basicConstraints spells out its default (X.690, 11.5)")
-    if not sequence.at_end():
-        path_length = sequence.integer()
-        if not ca:
-            raise CertificateError("basicConstraints has a path length, but not for a CA")
-    sequence.finish()
-    return BasicConstraints(ca, path_length)
+    with der.reading_sequence(value) as sequence:
+        ca = sequence.peek_tag() == der.BOOLEAN and sequence.boolean()
+        return BasicConstraints(ca, None if sequence.at_end() else sequence.integer())
 
 
 def basic_constraints(ca: bool, path_length: int | None) -> Extension:
@@ -171,9 +158,7 @@ def basic_constraints(ca: bool, path_length: int | None) -> Extension:
 
 
 def read_key_usage(value: bytes) -> frozenset[str]:
-    reader = der.Reader(value)
-    bits = reader.named_bits()
-    reader.finish()
+    bits = der.parse(value, der.Reader.named_bits)
     if not bits or max(bits) >= len(_KEY_USAGES):
         raise CertificateError("keyUsage has no bit set, or one that has no meaning")
     return frozenset(_KEY_USAGES[bit] for bit in bits)
@@ -181,28 +166,23 @@ def read_key_usage(value: bytes) -> frozenset[str]:
 
 def usage_names(names: Iterable[str]) -> frozenset[str]:
     """`names` under the names of this module; InvalidOption for one that is no key usage."""
-    wanted = set()
-    for name in names:
-        if name not in _KEY_USAGE_BITS:
+    wanted = ["nonRepudiation" if name == "contentCommitment" else name for name in names]
+    for name in wanted:
+        if name not in _KEY_USAGES:
             raise InvalidOption(f"unknown key usage {name!r}; there are {', '.join(_KEY_USAGES)}")
-        wanted.add(_KEY_USAGES[_KEY_USAGE_BITS[name]])
     return frozenset(wanted)
 
 
 def key_usage(names: Iterable[str]) -> Extension:
-    bits = [_KEY_USAGE_BITS[name] for name in usage_names(names)]
-    return Extension(KEY_USAGE, True, der.named_bits(bits))
+    return Extension(KEY_USAGE, True, der.named_bits(map(_KEY_USAGES.index, usage_names(names))))
 
 
 def read_extended_key_usage(value: bytes) -> tuple[str, ...]:
-    sequence = der.only_sequence(value)
-    purposes: list[str] = []
-    while not sequence.at_end():
-        oid = sequence.oid()
-        purposes.append(_PURPOSE_NAMES.get(oid, oid))
+    with der.reading_sequence(value) as sequence:
+        purposes = sequence.each(der.Reader.oid)
     if not purposes:
         raise CertificateError("extendedKeyUsage names no purpose")
-    return tuple(purposes)
+    return tuple(_PURPOSE_NAMES.get(oid, oid) for oid in purposes)
 
 
 def usage_oid(purpose: str) -> str:
@@ -219,23 +199,14 @@ def purpose_name(purpose: str) -> str:
 
 
 def extended_key_usage(purposes: Iterable[str]) -> Extension:
-    return Extension(EXTENDED_KEY_USAGE, False, der.sequence(*(der.oid(usage_oid(p)) for p in purposes)))
+    oids = [usage_oid(purpose) for purpose in purposes]
+    alone = oids == [_PURPOSES["timeStamping"]]  # RFC 3161, 2.3: that is critical, and stands alone
+    return Extension(EXTENDED_KEY_USAGE, alone, der.sequence(*map(der.oid, oids)))
 
 
-def key_identifier(point: bytes) -> bytes:
+def key_identifier(key: sm2.PublicKey) -> bytes:
     """4.2.1.2 leaves the method open; here the leading 160 bits of SM3 over the key's bit string."""
-    return sm3.digest(point)[:20]
-
-
-def subject_key_identifier(identifier: bytes) -> Extension:
-    return Extension(SUBJECT_KEY_IDENTIFIER, False, der.octet_string(identifier))
-
-
-def read_subject_key_identifier(value: bytes) -> bytes:
-    reader = der.Reader(value)
-    identifier = reader.octet_string()
-    reader.finish()
-    return identifier
+    return sm3.digest(key.to_bytes())[:20]
 
 
 def authority_key_identifier(identifier: bytes) -> Extension:
@@ -243,43 +214,23 @@ def authority_key_identifier(identifier: bytes) -> Extension:
 
 
 def read_authority_key_identifier(value: bytes) -> AuthorityKeyIdentifier:
-    sequence = der.only_sequence(value)
-    identifier = sequence.implicit(0) if sequence.has_implicit(0) else None
     issuer = serial = None
-    if sequence.has_explicit(1):
-        names = sequence.explicit(1)
-        while not names.at_end():
-            if names.has_explicit(4):
-                wrapped = names.explicit(4)
-                issuer = Name.read(wrapped)
-                wrapped.finish()
-            else:
-                names.checked()
-    if sequence.has_implicit(2):
-        serial = sequence.implicit_integer(2)
-    sequence.finish()
+    with der.reading_sequence(value) as sequence:
+        identifier = sequence.implicit(0) if sequence.has_implicit(0) else None
+        if sequence.has_explicit(1):
+            names = sequence.explicit(1)
+            while not names.at_end():
+                if names.has_explicit(4):
+                    issuer = Name.read(names.explicit(4))
+                else:
+                    names.checked()
+        if sequence.has_implicit(2):
+            serial = sequence.implicit_integer(2)
     return AuthorityKeyIdentifier(identifier, issuer, serial)
 
 
-def crl_number(number: int) -> Extension:
-    return Extension(CRL_NUMBER, False, der.integer(number))
-
-
-def read_crl_number(value: bytes) -> int:
-    reader = der.Reader(value)
-    number = reader.integer()
-    reader.finish()
-    return number
-
-
-def reason_code(reason: str) -> Extension:
-    return Extension(REASON_CODE, False, der.enumerated(REASONS[reason]))
-
-
 def read_reason_code(value: bytes) -> str:
-    reader = der.Reader(value)
-    reason = reader.enumerated()
-    reader.finish()
+    reason = der.parse(value, der.Reader.enumerated)
     if reason not in _REASON_NAMES:
         raise CertificateError(f"revocation reason {reason} has no meaning in a complete list")
     return _REASON_NAMES[reason]
@@ -292,10 +243,8 @@ _IA5_TAGS: Final = {name.lower(): tag for tag, name in _IA5_KINDS.items()}
 
 
 def read_subject_alt_names(value: bytes) -> tuple[str, ...]:
-    sequence = der.only_sequence(value)
-    names: list[str] = []
-    while not sequence.at_end():
-        names.append(_read_general_name(sequence))
+    with der.reading_sequence(value) as sequence:
+        names = sequence.each(_read_general_name)
     if not names:
         raise CertificateError("subjectAltName names nothing")
     return tuple(names)
@@ -315,13 +264,9 @@ def _read_general_name(reader: der.Reader) -> str:
             raise CertificateError(f"an IP address has {len(content)} bytes, not 4 or 16")
         return f"IP:{ip_address(content)}"
     if reader.has_implicit(8):
-        inner = der.Reader(der.element(der.OID, reader.implicit(8)))
-        return f"RID:{inner.oid()}"
+        return f"RID:{der.parse(der.element(der.OID, reader.implicit(8)), der.Reader.oid)}"
     if reader.has_explicit(4):
-        wrapped = reader.explicit(4)
-        name = Name.read(wrapped)
-        wrapped.finish()
-        return f"dirName:{name.rfc4514()}"
+        return f"dirName:{Name.read(reader.explicit(4)).rfc4514()}"
     if reader.has_explicit(0):
         return f"otherName:{reader.checked().hex()}"
     raise CertificateError("a subject alternative name is of a kind that is not supported")
@@ -353,9 +298,9 @@ _FIELDS: Final[dict[str, tuple[str, Callable[[bytes], object], object]]] = {
     "key_usage": (KEY_USAGE, read_key_usage, None),
     "extended_key_usage": (EXTENDED_KEY_USAGE, read_extended_key_usage, None),
     "subject_alt_names": (SUBJECT_ALT_NAME, read_subject_alt_names, ()),
-    "subject_key_identifier": (SUBJECT_KEY_IDENTIFIER, read_subject_key_identifier, None),
+    "subject_key_identifier": (SUBJECT_KEY_IDENTIFIER, lambda value: der.parse(value, der.Reader.octet_string), None),
     "authority_key_identifier": (AUTHORITY_KEY_IDENTIFIER, read_authority_key_identifier, None),
-    "number": (CRL_NUMBER, read_crl_number, None),
+    "number": (CRL_NUMBER, lambda value: der.parse(value, der.Reader.integer), None),
     "reason": (REASON_CODE, read_reason_code, "unspecified"),
 }
 
@@ -363,11 +308,8 @@ _FIELDS: Final[dict[str, tuple[str, Callable[[bytes], object], object]]] = {
 def values(extensions: Iterable[Extension], *fields: str) -> dict[str, object]:
     """What `extensions` say for each of `fields`; those of other kinds are not looked at."""
     present = {extension.oid: extension.value for extension in extensions}
-    found: dict[str, object] = {}
-    for field in fields:
-        oid, read, absent = _FIELDS[field]
-        found[field] = read(present[oid]) if oid in present else absent
-    return found
+    wanted = {field: _FIELDS[field] for field in fields}
+    return {field: read(present[oid]) if oid in present else absent for field, (oid, read, absent) in wanted.items()}
 
 
 def requested(
@@ -378,7 +320,7 @@ def requested(
     4.2.1.6: alternative names are critical where the subject is empty.
     """
     found: list[Extension] = []
-    alt_names, usages, purposes = _listed(alt_names), _listed(usages), _listed(purposes)
+    alt_names, usages, purposes = listed(alt_names), listed(usages), listed(purposes)
     if usages:
         found.append(key_usage(usages))
     if purposes:
@@ -388,10 +330,11 @@ def requested(
     return found
 
 
-def _listed(names: Iterable[str]) -> tuple[str, ...]:
+def listed(names: Iterable[str]) -> tuple[str, ...]:
+    """`names` as a tuple; TypeError where they are not several, or not text."""
     if isinstance(names, str):
         raise TypeError(f"a collection of names is needed, not the one str {names!r}")
-    listed = tuple(names)
-    for name in listed:
+    found = tuple(names)
+    for name in found:
         require_type(name, str, "each name")
-    return listed
+    return found

@@ -1,7 +1,7 @@
 """Making certificates: RFC 5280, 4.1 and 4.2; usages of TLCP's two certificates: GM/T 0015, GB/T 38636.
 
-`issue` signs what it is told to. Whether the CA's certificate allows it (CA flag,
-path length, usages) is what `verify_chain` judges, for everyone alike.
+`issue` verifies the request, and refuses an issuer that is no CA and an end after the issuer's own. Everything else
+about a path, such as path lengths, is what `verify_chain` judges, for everyone alike.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ from datetime import datetime
 from typing import Final
 
 from smcrypto import der, sm2
-from smcrypto.errors import InvalidKey, InvalidOption
+from smcrypto.errors import InvalidOption
 from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.x509 import extensions as ext
-from smcrypto.x509.certificate import Certificate
+from smcrypto.x509.certificate import Certificate, require_key_of
+from smcrypto.x509.chain import require_ca
 from smcrypto.x509.names import Name
 from smcrypto.x509.request import CertificateSigningRequest
 from smcrypto.x509.signed import SM2_WITH_SM3, instant, sign
@@ -56,26 +57,24 @@ def issue(
     and the like to grant it. subject: instead of the request's.
     key_usage: None gives CA_KEY_USAGE or SIGNING_KEY_USAGE, () no such extension.
     serial_number: None gives 159 random bits. extensions: further ones, as they are.
-    The request must be proven: `csr.verify(uid=…)` was called, or its signature
-    holds under `request_uid` (default: `uid`), else CertificateError.
-    InvalidKey: `ca_key` is not the key of `ca_certificate`. Naive times and values that cannot be
-    written are InvalidOption.
+    request_uid: that of the request's signature (default: `uid`), without which it is a CertificateSignatureError.
+    CertificateUsageError: `ca_certificate` is not that of a CA (basic constraints, keyCertSign).
+    InvalidKey: `ca_key` is not the key of `ca_certificate`. InvalidOption: `not_after` lies after that of
+    `ca_certificate`, a naive time, or a value that cannot be written.
     """
     require_type(csr, CertificateSigningRequest, "csr")
-    require_type(ca_certificate, Certificate, "ca_certificate")
-    require_type(ca_key, sm2.PrivateKey, "ca_key")
-    if ca_key.public_key != ca_certificate.public_key:
-        raise InvalidKey("ca_key is not the key of ca_certificate")
+    require_key_of(ca_certificate, ca_key)
     signer_uid = as_bytes(uid, "uid")
-    requester_uid = signer_uid if request_uid is None else as_bytes(request_uid, "request_uid")
-    if not csr.verified:
-        csr.verify(uid=requester_uid)
+    csr.verify(uid=signer_uid if request_uid is None else as_bytes(request_uid, "request_uid"))
+    require_ca(ca_certificate)
+    if instant(not_after, "not_after").replace(microsecond=0) > ca_certificate.not_after:
+        raise InvalidOption(f"not_after lies after {ca_certificate.not_after}, when the CA's certificate ends")
     return _certificate(
         issuer=ca_certificate.subject, authority=ca_certificate.subject_key_identifier,
         subject=csr.subject if subject is None else Name.build(subject), public_key=csr.public_key,
-        key=ca_key, uid=signer_uid, validity=_validity(not_before, not_after), serial_number=serial_number,
-        basic=ext.basic_constraints(ca, path_length), usages=_usages(key_usage, ca), purposes=extended_key_usage,
-        alt_names=subject_alt_names, further=extensions,
+        key=ca_key, uid=signer_uid, not_before=not_before, not_after=not_after, serial_number=serial_number,
+        ca=ca, path_length=path_length, usages=key_usage, purposes=extended_key_usage, alt_names=subject_alt_names,
+        further=extensions,
     )  # fmt: skip
 
 
@@ -98,61 +97,50 @@ def self_signed(
     require_type(key, sm2.PrivateKey, "key")
     name = Name.build(subject)
     return _certificate(
-        issuer=name, authority=ext.key_identifier(key.public_key.to_bytes()), subject=name, public_key=key.public_key,
-        key=key, uid=as_bytes(uid, "uid"), validity=_validity(not_before, not_after), serial_number=serial_number,
-        basic=ext.basic_constraints(ca, path_length), usages=_usages(key_usage, ca), purposes=extended_key_usage,
-        alt_names=subject_alt_names, further=extensions,
+        issuer=name, authority=ext.key_identifier(key.public_key), subject=name, public_key=key.public_key,
+        key=key, uid=as_bytes(uid, "uid"), not_before=not_before, not_after=not_after, serial_number=serial_number,
+        ca=ca, path_length=path_length, usages=key_usage, purposes=extended_key_usage, alt_names=subject_alt_names,
+        further=extensions,
     )  # fmt: skip
 
 
 def _certificate(
     *, issuer: Name, authority: bytes | None, subject: Name, public_key: sm2.PublicKey, key: sm2.PrivateKey, uid: bytes,
-    validity: bytes, serial_number: int | None, basic: ext.Extension, usages: Iterable[str], purposes: Iterable[str],
-    alt_names: Iterable[str], further: Iterable[ext.Extension],
+    not_before: datetime, not_after: datetime, serial_number: int | None, ca: bool, path_length: int | None,
+    usages: Iterable[str] | None, purposes: Iterable[str], alt_names: Iterable[str], further: Iterable[ext.Extension],
 ) -> Certificate:  # fmt: skip
+    begin, end = instant(not_before, "not_before"), instant(not_after, "not_after")
+    if end < begin:
+        raise InvalidOption("not_after lies before not_before")
     if not issuer:
         raise InvalidOption("the issuer's name must not be empty (RFC 5280, 4.1.2.4)")
+    basic = ext.basic_constraints(ca, path_length)
+    if usages is None:
+        usages = CA_KEY_USAGE if ca else SIGNING_KEY_USAGE
     wanted = ext.requested(subject, alt_names, usages, purposes)
     if not subject and not any(e.oid == ext.SUBJECT_ALT_NAME for e in wanted):
         raise InvalidOption("a certificate needs a subject or a subject alternative name")
-    all_extensions = [basic, *wanted, ext.subject_key_identifier(ext.key_identifier(public_key.to_bytes()))]
+    identifier = ext.Extension(ext.SUBJECT_KEY_IDENTIFIER, False, der.octet_string(ext.key_identifier(public_key)))
+    all_extensions = [basic, *wanted, identifier]
     if authority is not None:
         all_extensions.append(ext.authority_key_identifier(authority))
     for extension in further:
         require_type(extension, ext.Extension, "each of extensions")
         all_extensions.append(extension)
-    kinds = [e.oid for e in all_extensions]
-    if len(set(kinds)) != len(kinds):
+    if len({e.oid for e in all_extensions}) != len(all_extensions):
         raise InvalidOption("an extension is given twice")
+    if serial_number is None:
+        serial_number = secrets.randbelow(_MAX_SERIAL) + 1
+    elif not 1 <= require_int(serial_number, "serial_number") <= _MAX_SERIAL:
+        raise InvalidOption("serial_number must be positive and fit 20 bytes (RFC 5280, 4.1.2.2)")
     body = der.sequence(
         der.explicit(0, der.integer(2)),  # version 3
-        der.integer(_serial(serial_number)),
+        der.integer(serial_number),
         SM2_WITH_SM3,
         issuer.to_der(),
-        validity,
+        der.sequence(der.time(begin), der.time(end)),
         subject.to_der(),
         public_key.to_der(),
         der.explicit(3, der.sequence(*(e.to_der() for e in all_extensions))),
     )
     return Certificate.from_der(sign(body, key, uid))
-
-
-def _usages(names: Iterable[str] | None, ca: bool) -> Iterable[str]:
-    if names is None:
-        return CA_KEY_USAGE if ca else SIGNING_KEY_USAGE
-    return names
-
-
-def _validity(not_before: datetime, not_after: datetime) -> bytes:
-    begin, end = instant(not_before, "not_before"), instant(not_after, "not_after")
-    if end < begin:
-        raise InvalidOption("not_after lies before not_before")
-    return der.sequence(der.time(begin), der.time(end))
-
-
-def _serial(number: int | None) -> int:
-    if number is None:
-        return secrets.randbelow(_MAX_SERIAL) + 1
-    if not 1 <= require_int(number, "serial_number") <= _MAX_SERIAL:
-        raise InvalidOption("serial_number must be positive and fit 20 bytes (RFC 5280, 4.1.2.2)")
-    return number

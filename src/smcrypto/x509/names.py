@@ -18,45 +18,32 @@ from smcrypto.inputs import require_type
 
 __all__ = ["Attribute", "Name", "written_oid"]
 
-# Attribute types: short name (RFC 4514, 3, and OpenSSL's for the rest), identifier,
-# upper bound in characters on writing (RFC 5280, appendix A.1), string type on writing.
+# Attribute types: short name (RFC 4514, 3, and OpenSSL's for the rest), long name (X.520, RFC 4519; understood, never
+# printed), identifier, upper bound in characters on writing (RFC 5280, appendix A.1), string type on writing.
 _TYPES: Final = (
-    ("CN", "2.5.4.3", 64, der.UTF8_STRING),
-    ("SN", "2.5.4.4", 40, der.UTF8_STRING),
-    ("serialNumber", "2.5.4.5", 64, der.PRINTABLE_STRING),
-    ("C", "2.5.4.6", 2, der.PRINTABLE_STRING),
-    ("L", "2.5.4.7", 128, der.UTF8_STRING),
-    ("ST", "2.5.4.8", 128, der.UTF8_STRING),
-    ("STREET", "2.5.4.9", 128, der.UTF8_STRING),
-    ("O", "2.5.4.10", 64, der.UTF8_STRING),
-    ("OU", "2.5.4.11", 64, der.UTF8_STRING),
-    ("title", "2.5.4.12", 64, der.UTF8_STRING),
-    ("GN", "2.5.4.42", 16, der.UTF8_STRING),
-    ("initials", "2.5.4.43", 5, der.UTF8_STRING),
-    ("generationQualifier", "2.5.4.44", 3, der.UTF8_STRING),
-    ("dnQualifier", "2.5.4.46", 64, der.PRINTABLE_STRING),
-    ("pseudonym", "2.5.4.65", 128, der.UTF8_STRING),
-    ("UID", "0.9.2342.19200300.100.1.1", 256, der.UTF8_STRING),
-    ("DC", "0.9.2342.19200300.100.1.25", 63, der.IA5_STRING),
-    ("emailAddress", "1.2.840.113549.1.9.1", 255, der.IA5_STRING),
+    ("CN", "commonName", "2.5.4.3", 64, der.UTF8_STRING),
+    ("SN", "surname", "2.5.4.4", 40, der.UTF8_STRING),
+    ("serialNumber", "serialNumber", "2.5.4.5", 64, der.PRINTABLE_STRING),
+    ("C", "countryName", "2.5.4.6", 2, der.PRINTABLE_STRING),
+    ("L", "localityName", "2.5.4.7", 128, der.UTF8_STRING),
+    ("ST", "stateOrProvinceName", "2.5.4.8", 128, der.UTF8_STRING),
+    ("STREET", "streetAddress", "2.5.4.9", 128, der.UTF8_STRING),
+    ("O", "organizationName", "2.5.4.10", 64, der.UTF8_STRING),
+    ("OU", "organizationalUnitName", "2.5.4.11", 64, der.UTF8_STRING),
+    ("title", "title", "2.5.4.12", 64, der.UTF8_STRING),
+    ("GN", "givenName", "2.5.4.42", 16, der.UTF8_STRING),
+    ("initials", "initials", "2.5.4.43", 5, der.UTF8_STRING),
+    ("generationQualifier", "generationQualifier", "2.5.4.44", 3, der.UTF8_STRING),
+    ("dnQualifier", "dnQualifier", "2.5.4.46", 64, der.PRINTABLE_STRING),
+    ("pseudonym", "pseudonym", "2.5.4.65", 128, der.UTF8_STRING),
+    ("UID", "userId", "0.9.2342.19200300.100.1.1", 256, der.UTF8_STRING),
+    ("DC", "domainComponent", "0.9.2342.19200300.100.1.25", 63, der.IA5_STRING),
+    ("emailAddress", "emailAddress", "1.2.840.113549.1.9.1", 255, der.IA5_STRING),
 )
-_BY_OID: Final = {oid: name for name, oid, _, _ in _TYPES}
-# The long names of X.520 and RFC 4519, understood where a type is given, never printed.
-_LONG: Final = {
-    "commonname": "CN",
-    "surname": "SN",
-    "countryname": "C",
-    "localityname": "L",
-    "stateorprovincename": "ST",
-    "streetaddress": "STREET",
-    "organizationname": "O",
-    "organizationalunitname": "OU",
-    "givenname": "GN",
-    "userid": "UID",
-    "domaincomponent": "DC",
+_BY_OID: Final = {oid: short for short, _, oid, _, _ in _TYPES}
+_BY_NAME: Final = {
+    name.lower(): (oid, bound, tag) for short, long, oid, bound, tag in _TYPES for name in (short, long)
 }
-_SHORT: Final = {name.lower(): (oid, bound, tag) for name, oid, bound, tag in _TYPES}
-_BY_NAME: Final = _SHORT | {long: _SHORT[short.lower()] for long, short in _LONG.items()}
 _COUNTRY: Final = "2.5.4.6"
 _PRINTABLE: Final = re.compile(r"[A-Za-z0-9 '()+,\-./:=?]*")  # X.680, 41.4
 # PrintableString is read more widely than X.680 allows, because CAs write "*", "@", "_" and "&" into it.
@@ -70,7 +57,7 @@ _CODECS: Final = {
     der.BMP_STRING: "utf-16-be",
     der.UNIVERSAL_STRING: "utf-32-be",
 }
-_SPECIAL: Final = frozenset('"+,;<>\\')
+_SPECIAL: Final = re.compile(r'["+,;<>\\]|\A[ #]| \Z')
 
 
 class Attribute(NamedTuple):
@@ -90,14 +77,13 @@ class Attribute(NamedTuple):
 class Name:
     """A distinguished name: relative names from the root of the tree downwards, each a set of attributes."""
 
-    __slots__ = ("_der", "_key", "_rdns")
+    __slots__ = ("_der", "_rdns")
 
     def __init__(self, rdns: Iterable[Iterable[Attribute]] = ()) -> None:
         self._rdns = tuple(tuple(sorted(rdn, key=_encode_attribute)) for rdn in rdns)
         if not all(self._rdns):
             raise InvalidOption("a relative distinguished name needs an attribute")
         self._der = der.sequence(*(der.set_of(*map(_encode_attribute, rdn)) for rdn in self._rdns))
-        self._key: tuple[tuple[int, frozenset[tuple[str, bytes | str]]], ...] | None = None
 
     @classmethod
     def build(cls, subject: Name | str | Mapping[str, str] | Iterable[tuple[str, str]]) -> Name:
@@ -111,8 +97,11 @@ class Name:
             return subject
         if isinstance(subject, str):
             return cls.from_rfc4514(subject)
-        pairs = subject.items() if isinstance(subject, Mapping) else subject
-        return cls([(_attribute(*_pair(pair)),) for pair in pairs])
+        pairs = tuple(subject.items() if isinstance(subject, Mapping) else subject)
+        for pair in pairs:
+            if not isinstance(pair, tuple | list) or len(pair) != 2:
+                raise TypeError(f"a name is made of pairs of type and value, not of {pair!r}")
+        return cls((_attribute(kind, text),) for kind, text in pairs)
 
     @classmethod
     def from_rfc4514(cls, text: str) -> Name:
@@ -122,22 +111,10 @@ class Name:
     @classmethod
     def read(cls, reader: der.Reader) -> Name:
         """Name ::= RDNSequence, X.501, 9.2. CertificateError for a string that is not one."""
-        encoded = reader.raw()
-        sequence = der.only_sequence(encoded)
-        rdns: list[tuple[Attribute, ...]] = []
-        while not sequence.at_end():
-            members = sequence.set_of()
-            rdn: list[Attribute] = []
-            while not members.at_end():
-                rdn.append(_read_attribute(members.sequence()))
-            if not rdn:
-                raise CertificateError("a relative distinguished name is empty")
-            rdns.append(tuple(rdn))
-        name = cls.__new__(cls)
-        name._rdns = tuple(rdns)
-        name._der = encoded
-        name._key = None
-        return name
+        rdns = reader.sequence().each(lambda one: one.set_of().each(lambda member: _read_attribute(member.sequence())))
+        if not all(rdns):
+            raise CertificateError("a relative distinguished name is empty")
+        return cls(rdns)  # in DER there is one way to write it, the one that was read
 
     @property
     def rdns(self) -> tuple[tuple[Attribute, ...], ...]:
@@ -163,11 +140,11 @@ class Name:
         """RFC 4514, 2: the last relative name first; what could mislead a reader is escaped."""
         return ",".join("+".join(_print_attribute(a) for a in rdn) for rdn in reversed(self._rdns))
 
+    __str__ = rfc4514
+
     def _comparable(self) -> tuple[tuple[int, frozenset[tuple[str, bytes | str]]], ...]:
-        if self._key is None:
-            folded = ([(a.oid, a.value if a.text is None else _fold(a.text)) for a in rdn] for rdn in self._rdns)
-            self._key = tuple((len(rdn), frozenset(rdn)) for rdn in folded)
-        return self._key
+        folded = ([(a.oid, a.value if a.text is None else _fold(a.text)) for a in rdn] for rdn in self._rdns)
+        return tuple((len(rdn), frozenset(rdn)) for rdn in folded)
 
     def __bool__(self) -> bool:
         return bool(self._rdns)
@@ -179,9 +156,6 @@ class Name:
 
     def __hash__(self) -> int:
         return hash(self._comparable())
-
-    def __str__(self) -> str:
-        return self.rfc4514()
 
     def __repr__(self) -> str:
         return f"<Name {self.rfc4514()}>"
@@ -202,11 +176,10 @@ def _encode_attribute(attribute: Attribute) -> bytes:
 def _read_attribute(reader: der.Reader) -> Attribute:
     oid = reader.oid()
     value = reader.checked()
-    reader.finish()
     codec = _CODECS.get(value[0])
     text = None
     if codec is not None:
-        content = der.Reader(value).value(value[0])
+        content = der.parse(value, lambda one: one.value(value[0]))
         try:
             text = content.decode(codec)
         except UnicodeDecodeError:
@@ -220,12 +193,6 @@ def written_oid(dotted: str, problem: str) -> bytes:
         return der.oid(dotted)
     except InvalidEncoding:
         raise InvalidOption(problem) from None
-
-
-def _pair(pair: tuple[str, str]) -> tuple[str, str]:
-    if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise TypeError(f"a name is made of pairs of type and value, not of {pair!r}")
-    return pair[0], pair[1]
 
 
 def _attribute(kind: str, text: str) -> Attribute:
@@ -256,73 +223,50 @@ def _print_attribute(attribute: Attribute) -> str:
 
 def _escape(text: str) -> str:
     """2.4, and hex pairs for whatever does not print: controls, line ends, bidirectional marks, odd blanks."""
-    out = []
-    for i, c in enumerate(text):
-        edge_blank = c == " " and i in (0, len(text) - 1)
-        if c in _SPECIAL or edge_blank or (c == "#" and i == 0):
-            out.append("\\" + c)
-        elif c.isprintable():
-            out.append(c)
-        else:
-            out.append("".join(f"\\{byte:02x}" for byte in c.encode("utf-8", "surrogatepass")))
-    return "".join(out)
+    return "".join(
+        c if c.isprintable() else "".join(f"\\{byte:02x}" for byte in c.encode("utf-8", "surrogatepass"))
+        for c in _SPECIAL.sub(r"\\\g<0>", text)
+    )
 
 
-_PAIR: Final = re.compile(r'((?:\\[0-9A-Fa-f]{2})+)|\\([ "#+,;<=>\\])|([^\\"+,;<>\x00])', re.DOTALL)
-_KIND: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9-]*|[0-9]+(?:\.[0-9]+)+)\s*=\s*")
-_HEX: Final = re.compile(r"#((?:[0-9A-Fa-f]{2})+)[ ]*")
+# 3: one type and value, up to the separator. Blanks around both do not count unless they are escaped; a leading #
+# that is not escaped precedes the value's DER in hex.
+_KIND: Final = r"\s*([A-Za-z][A-Za-z0-9-]*|[0-9]+(?:\.[0-9]+)+)\s*=\s*(?!\s)"
+_ESCAPED: Final = r'\\(?:[0-9A-Fa-f]{2}|[ "#+,;<=>\\])'
+_PLAIN: Final = r'[^\\"+,;<>\x00'
+_VALUE: Final = rf"(?!#)((?:(?:{_ESCAPED}|{_PLAIN}])*(?:{_ESCAPED}|{_PLAIN} ]))?)"
+_PART: Final = re.compile(rf"{_KIND}(?:#((?:[0-9A-Fa-f]{{2}})+)|{_VALUE}) *([+,]|\Z)")
+_ESCAPE: Final = re.compile(r"((?:\\[0-9A-Fa-f]{2})+)|\\(.)")
 
 
-def _parse(text: str) -> list[tuple[Attribute, ...]]:
+def _parse(text: str) -> list[list[Attribute]]:
     """RFC 4514, 3: the relative names in the order of the text."""
-    rdns: list[tuple[Attribute, ...]] = []
-    rdn: list[Attribute] = []
+    rdns: list[list[Attribute]] = [[]]
     position = 0
-    while True:
-        kind = _KIND.match(text, position)
-        if kind is None:
-            raise InvalidOption(f"not a distinguished name of RFC 4514: expected TYPE= at character {position}")
-        position = kind.end()
-        hexadecimal = _HEX.match(text, position)
-        if hexadecimal is not None:
-            position = hexadecimal.end()
-            rdn.append(_hex_attribute(kind[1], bytes.fromhex(hexadecimal[1])))
-        elif text.startswith("#", position):
-            raise InvalidOption("not a distinguished name of RFC 4514: a leading # must be escaped or precede hex")
-        else:
-            value, position = _parse_value(text, position)
-            rdn.append(_attribute(kind[1], value))
-        separator = text[position : position + 1]
-        position += 1
-        if separator != "+":
-            rdns.append(tuple(rdn))
-            rdn = []
+    while (part := _PART.match(text, position)) is not None:
+        kind, hexadecimal, value, separator = part.groups()
+        rdns[-1].append(_attribute(kind, _ESCAPE.sub(_unescape, value)) if hexadecimal is None
+                        else _hex_attribute(kind, bytes.fromhex(hexadecimal)))  # fmt: skip
+        position = part.end()
         if not separator:
             return rdns
-        if separator not in ",+":
-            raise InvalidOption(f"not a distinguished name of RFC 4514: {separator!r} must be escaped")
+        if separator == ",":
+            rdns.append([])
+    raise InvalidOption(f"not a distinguished name of RFC 4514 (TYPE=value, …) from character {position} on")
+
+
+def _unescape(escape: re.Match[str]) -> str:
+    if escape[2]:
+        return escape[2]
+    try:
+        return bytes.fromhex(escape[1].replace("\\", "")).decode("utf-8")
+    except UnicodeDecodeError:
+        raise InvalidOption("the escaped bytes of a name are not UTF-8") from None
 
 
 def _hex_attribute(kind: str, value: bytes) -> Attribute:
     oid, _, _ = _BY_NAME.get(kind.lower(), (kind, 0, 0))
     try:
-        return _read_attribute(der.Reader(der.oid(oid) + der.check(value)))
+        return der.parse(der.oid(oid) + der.check(value), _read_attribute)
     except (CertificateError, InvalidEncoding) as error:
         raise InvalidOption(f"the value after {kind}=# is no attribute value: {error}") from None
-
-
-def _parse_value(text: str, position: int) -> tuple[str, int]:
-    value = ""
-    kept = 0  # characters that may not be trimmed: everything up to the last one that is escaped or not blank
-    while (pair := _PAIR.match(text, position)) is not None:
-        position = pair.end()
-        if pair[1]:
-            try:
-                value += bytes.fromhex(pair[1].replace("\\", "")).decode("utf-8")
-            except UnicodeDecodeError:
-                raise InvalidOption("the escaped bytes of a name are not UTF-8") from None
-        else:
-            value += pair[2] or pair[3]
-        if pair[3] != " ":
-            kept = len(value)
-    return value[:kept], position

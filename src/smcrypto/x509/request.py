@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 from smcrypto import der, sm2
 from smcrypto.errors import CertificateError
 from smcrypto.inputs import BytesLike, as_bytes, require_type
-from smcrypto.sm2 import keyfiles
 from smcrypto.x509 import extensions as ext
 from smcrypto.x509.names import Name
 from smcrypto.x509.signed import Signed, sign
@@ -47,8 +46,6 @@ class CertificateSigningRequest(Signed):
     """The usages asked for, by name; None if nothing is said."""
     extended_key_usage: tuple[str, ...] | None
     """The purposes asked for, by name or dotted identifier; None if nothing is said."""
-    verified: bool
-    """Did `verify` succeed on this object, or was it made here?"""
 
     @classmethod
     def create(
@@ -73,58 +70,39 @@ class CertificateSigningRequest(Signed):
             extensions = der.sequence(*(e.to_der() for e in wanted))
             attributes.append(der.sequence(der.oid(_EXTENSION_REQUEST), der.set_of(extensions)))
         body = der.sequence(der.integer(0), name.to_der(), key.public_key.to_der(), der.explicit(0, *attributes))
-        request = cls.from_der(sign(body, key, as_bytes(uid, "uid")))
-        request._fill(verified=True)
-        return request
+        return cls.from_der(sign(body, key, as_bytes(uid, "uid")))
 
     def _read(self, body: der.Reader) -> None:
         version = body.integer()
         if version != 0:
             raise CertificateError(f"request version {version}")
         subject = Name.read(body)
-        public_key = sm2.PublicKey.from_bytes(keyfiles.load_public(body.raw(), form="der"))
+        public_key = sm2.PublicKey.from_der(body.raw())
         # RFC 2986 wants [0] even when it is empty; some software leaves it out then.
-        attributes = _read_attributes(body.implicit_set_of(0)) if body.has_explicit(0) else ()
-        extensions = _requested_extensions(attributes)
+        attributes = tuple(body.implicit_set_of(0).each(_read_attribute)) if body.has_explicit(0) else ()
+        extensions: list[ext.Extension] = []
+        for attribute in attributes:  # Java's tools ask for each extension in an attribute of its own
+            if attribute.oid == _EXTENSION_REQUEST:
+                if len(attribute.values) != 1:
+                    raise CertificateError("a request for extensions has not exactly one value")
+                extensions += der.parse(attribute.values[0], ext.read_extensions)
+        ext.require_distinct(extensions)
         self._fill(
-            subject=subject, public_key=public_key, attributes=attributes, extensions=extensions, verified=False,
+            subject=subject, public_key=public_key, attributes=attributes, extensions=tuple(extensions),
             **ext.values(extensions, "subject_alt_names", "key_usage", "extended_key_usage"),
         )  # fmt: skip
 
     def verify(self, *, uid: BytesLike = sm2.DEFAULT_UID) -> None:
         """CertificateError unless the key in the request made its signature under `uid`."""
         self._verify(self.public_key, as_bytes(uid, "uid"), f"the request of {self.subject or 'nobody'}")
-        self._fill(verified=True)
 
     def __repr__(self) -> str:
         return f"<CertificateSigningRequest {self.subject}>"
 
 
-def _read_attributes(reader: der.Reader) -> tuple[RequestAttribute, ...]:
-    attributes: list[RequestAttribute] = []
-    while not reader.at_end():
-        one = reader.sequence()
-        oid = one.oid()
-        members = one.set_of()
-        one.finish()
-        values: list[bytes] = []
-        while not members.at_end():
-            values.append(members.checked())
-        if not values:
-            raise CertificateError(f"attribute {oid} has no value")
-        attributes.append(RequestAttribute(oid, tuple(values)))
-    return tuple(attributes)
-
-
-def _requested_extensions(attributes: tuple[RequestAttribute, ...]) -> tuple[ext.Extension, ...]:
-    """All that is asked for; Java's tools ask for each extension in an attribute of its own."""
-    found: list[ext.Extension] = []
-    for attribute in attributes:
-        if attribute.oid == _EXTENSION_REQUEST:
-            if len(attribute.values) != 1:
-                raise CertificateError("a request for extensions has not exactly one value")
-            reader = der.Reader(attribute.values[0])
-            found += ext.read_extensions(reader)
-    if len({extension.oid for extension in found}) != len(found):
-        raise CertificateError("an extension is asked for twice")
-    return tuple(found)
+def _read_attribute(reader: der.Reader) -> RequestAttribute:
+    one = reader.sequence()
+    attribute = RequestAttribute(one.oid(), tuple(one.set_of().rest()))
+    if not attribute.values:
+        raise CertificateError(f"attribute {attribute.oid} has no value")
+    return attribute

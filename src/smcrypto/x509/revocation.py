@@ -14,12 +14,12 @@ from itertools import pairwise
 from typing import Final
 
 from smcrypto import der, sm2
-from smcrypto.errors import CertificateError, InvalidKey, InvalidOption
+from smcrypto.errors import CertificateError, CertificateRevokedError, InvalidOption
 from smcrypto.inputs import BytesLike, as_bytes, require_int, require_type
 from smcrypto.x509 import extensions as ext
-from smcrypto.x509.certificate import Certificate
+from smcrypto.x509.certificate import Certificate, require_key_of, require_usage
 from smcrypto.x509.names import Name
-from smcrypto.x509.signed import SM2_WITH_SM3, CertificateRevokedError, Signed, instant, sign
+from smcrypto.x509.signed import SM2_WITH_SM3, Signed, instant, sign
 
 __all__ = ["CertificateRevocationList", "RevokedCertificate", "check_revocation"]
 
@@ -74,10 +74,7 @@ class CertificateRevocationList(Signed):
         InvalidKey: `ca_key` is not the key of `ca_certificate`. InvalidOption:
         an entry twice, an unknown reason, a negative number or serial number, naive or reversed times.
         """
-        require_type(ca_certificate, Certificate, "ca_certificate")
-        require_type(ca_key, sm2.PrivateKey, "ca_key")
-        if ca_key.public_key != ca_certificate.public_key:
-            raise InvalidKey("ca_key is not the key of ca_certificate")
+        require_key_of(ca_certificate, ca_key)
         begin, end = instant(this_update, "this_update"), instant(next_update, "next_update")
         if end < begin:
             raise InvalidOption("next_update lies before this_update")
@@ -90,7 +87,7 @@ class CertificateRevocationList(Signed):
                 raise InvalidOption("a serial number that is revoked must not be negative")
         if len({entry.serial_number for entry in entries}) != len(entries):
             raise InvalidOption("a serial number is revoked twice")
-        extensions = [ext.crl_number(number)]
+        extensions = [ext.Extension(ext.CRL_NUMBER, False, der.integer(number))]
         if ca_certificate.subject_key_identifier is not None:
             extensions.insert(0, ext.authority_key_identifier(ca_certificate.subject_key_identifier))
         body = der.sequence(
@@ -114,8 +111,20 @@ class CertificateRevocationList(Signed):
         by_serial: dict[int, RevokedCertificate] = {}
         critical: list[str] = []
         if body.peek_tag() == der.SEQUENCE:
-            critical += _read_entries(body.sequence(), by_serial)
-        extensions = ext.read_optional(body, 0) if version_2 else ()
+            entries = body.sequence()
+            if entries.at_end():
+                raise CertificateError("the list of revoked certificates is there, but empty (RFC 5280, 5.1.2.6)")
+            while not entries.at_end():
+                entry = entries.sequence()
+                serial_number, revoked_at, reason = entry.integer(signed=True), entry.time(), "unspecified"
+                if not entry.at_end():
+                    extensions = ext.read_extensions(entry)
+                    reason = str(ext.values(extensions, "reason")["reason"])
+                    critical += [e.oid for e in extensions if e.critical and e.oid != ext.REASON_CODE]
+                if serial_number in by_serial:
+                    raise CertificateError(f"serial number {serial_number:x} is listed twice")
+                by_serial[serial_number] = RevokedCertificate(serial_number, revoked_at, reason)
+        extensions = ext.read_extensions(body.explicit(0)) if version_2 and body.has_explicit(0) else ()
         critical += [e.oid for e in extensions if e.critical and e.oid not in _UNDERSTOOD]
         self._fill(
             issuer=issuer, this_update=this_update, next_update=next_update, extensions=extensions,
@@ -138,8 +147,7 @@ class CertificateRevocationList(Signed):
         what = f"the revocation list of {self.issuer}"
         if issuer.subject != self.issuer:
             raise CertificateError(f"{what} is not from {issuer.subject}")
-        if issuer.key_usage is not None and "cRLSign" not in issuer.key_usage:
-            raise CertificateError(f"{issuer.subject} may not sign revocation lists (no cRLSign)")
+        require_usage(issuer, "may not sign revocation lists (no cRLSign)", "cRLSign")
         if self._not_understood:
             oid = self._not_understood[0]
             raise CertificateError(f"{what} has the critical extension {oid}, which is not understood")
@@ -158,31 +166,13 @@ class CertificateRevocationList(Signed):
         return f"<CertificateRevocationList of {self.issuer}, {len(self._by_serial)} revoked>"
 
 
-def _read_entries(entries: der.Reader, by_serial: dict[int, RevokedCertificate]) -> list[str]:
-    """Puts the entries into `by_serial`; returns their critical extensions that are not understood."""
-    if entries.at_end():
-        raise CertificateError("the list of revoked certificates is there, but empty (RFC 5280, 5.1.2.6)")
-    critical: list[str] = []
-    while not entries.at_end():
-        entry = entries.sequence()
-        serial_number, revoked_at, reason = entry.integer(), entry.time(), "unspecified"
-        if not entry.at_end():
-            extensions = ext.read_extensions(entry)
-            reason = str(ext.values(extensions, "reason")["reason"])
-            critical += [e.oid for e in extensions if e.critical and e.oid != ext.REASON_CODE]
-        entry.finish()
-        if serial_number in by_serial:
-            raise CertificateError(f"serial number {serial_number:x} is listed twice")
-        by_serial[serial_number] = RevokedCertificate(serial_number, revoked_at, reason)
-    return critical
-
-
 def _write_entry(entry: RevokedCertificate) -> bytes:
     if entry.reason not in ext.REASONS:
         raise InvalidOption(f"unknown reason {entry.reason!r}; there are {', '.join(ext.REASONS)}")
     parts = [der.integer(entry.serial_number), der.time(instant(entry.revoked_at, "revoked_at"))]
     if entry.reason != "unspecified":  # 5.3.1: left out rather than said
-        parts.append(der.sequence(ext.reason_code(entry.reason).to_der()))
+        reason = der.enumerated(ext.REASONS[entry.reason])
+        parts.append(der.sequence(ext.Extension(ext.REASON_CODE, False, reason).to_der()))
     return der.sequence(*parts)
 
 
@@ -199,10 +189,10 @@ def check_revocation(
     """
     for position, (certificate, issuer) in enumerate(pairwise(path)):
         problem: CertificateError | None = None
+        if every or position == 0:
+            problem = CertificateError(f"there is no revocation list of {certificate.issuer} for {certificate.subject}")
         known = False
-        for crl in crls:
-            if crl.issuer != certificate.issuer:
-                continue
+        for crl in (crl for crl in crls if crl.issuer == certificate.issuer):
             try:
                 crl.require_fresh(at)  # first, as it costs nothing
                 verify(crl, issuer)
@@ -210,12 +200,9 @@ def check_revocation(
                 problem = error
                 continue
             known = True
-            entry = crl.find(certificate.serial_number)
-            if entry is not None:
+            if (entry := crl.find(certificate.serial_number)) is not None:
                 raise CertificateRevokedError(
                     f"{certificate.subject} was revoked at {entry.revoked_at}: {entry.reason}"
                 )
         if not known and problem is not None:
             raise problem
-        if not known and (every or position == 0):
-            raise CertificateError(f"there is no revocation list of {certificate.issuer} for {certificate.subject}")

@@ -15,39 +15,34 @@ from datetime import datetime, timezone
 from typing import ClassVar, Final, TypeVar
 
 from smcrypto import der, pem, sm2
-from smcrypto.errors import CertificateError, InvalidEncoding, InvalidKey, InvalidOption, InvalidSignature
+from smcrypto.errors import (
+    CertificateAlgorithmError,
+    CertificateError,
+    CertificateMalformedError,
+    CertificateSignatureError,
+    InvalidEncoding,
+    InvalidKey,
+    InvalidOption,
+    InvalidSignature,
+)
 from smcrypto.inputs import BytesLike, as_bytes
 
-__all__ = [
-    "SM2_WITH_SM3",
-    "CertificateRevokedError",
-    "CertificateSignatureError",
-    "Signed",
-    "instant",
-    "parsing",
-    "sign",
-]
+__all__ = ["SM2_WITH_SM3", "Signed", "instant", "parsing", "require_signature", "sign"]
 
 SM2_WITH_SM3: Final = der.sequence(der.oid("1.2.156.10197.1.501"))
 # Parameters are absent in what OpenSSL, Tongsuo and GmSSL write; some older software writes NULL.
 _ACCEPTED: Final = (SM2_WITH_SM3, der.sequence(der.oid("1.2.156.10197.1.501"), der.null()))
 
 
-class CertificateSignatureError(CertificateError, InvalidSignature):
-    """The signature of a certificate, request or revocation list does not hold."""
-
-
-class CertificateRevokedError(CertificateError):
-    """A revocation list of its issuer names the certificate."""
-
-
 @contextmanager
-def parsing(what: str) -> Iterator[None]:
-    """Every way in which bytes are not a `what` is a CertificateError that says so."""
+def parsing(what: str, kind: type[CertificateError] = CertificateError) -> Iterator[None]:
+    """Every way in which bytes are not a `what` is a `kind` that says so; another algorithm stays what it is."""
     try:
         yield
+    except CertificateAlgorithmError:
+        raise
     except (InvalidEncoding, InvalidKey, CertificateError) as error:
-        raise CertificateError(f"not a valid {what}: {error}") from None
+        raise kind(f"not a valid {what}: {error}") from None
 
 
 _T = TypeVar("_T", bound="Signed")
@@ -81,17 +76,19 @@ class Signed:
 
     @classmethod
     def from_der(cls: type[_T], data: BytesLike) -> _T:
-        """CertificateError for anything but the DER of one, with an SM2 key. The signature is not verified here."""
+        """CertificateError for anything but the DER of one; the signature is not verified here.
+
+        CertificateMalformedError: it has the outer form of one, but a field is not well formed.
+        CertificateAlgorithmError: a certificate whose key is not of SM2.
+        """
         octets = as_bytes(data, "data")
         made = object.__new__(cls)
         with parsing(cls.KIND):
-            outer = der.only_sequence(octets)
-            body, algorithm, signature = outer.raw(), outer.checked(), outer.bit_string()
-            outer.finish()
+            with der.reading_sequence(octets) as outer:
+                body, algorithm, signature = outer.raw(), outer.checked(), outer.bit_string()
             made._fill(_der=octets, _body=body, _algorithm=algorithm, signature=signature)
-            fields = der.only_sequence(body)
+        with parsing(cls.KIND, CertificateMalformedError), der.reading_sequence(body) as fields:
             made._read(fields)
-            fields.finish()
         return made
 
     def _read(self, body: der.Reader) -> None:
@@ -107,12 +104,7 @@ class Signed:
             raise CertificateError("the two statements of the signature algorithm differ (RFC 5280, 4.1.1.2)")
 
     def _verify(self, public_key: sm2.PublicKey, uid: bytes, what: str) -> None:
-        if self._algorithm not in _ACCEPTED:
-            raise CertificateError(f"{what} is not signed with SM2-with-SM3, the only algorithm supported")
-        try:
-            public_key.verify(self.signature, self._body, uid=uid)
-        except InvalidSignature:
-            raise CertificateSignatureError(f"the signature of {what} does not hold") from None
+        require_signature(public_key, self._body, self._algorithm, self.signature, uid, what)
 
     def to_der(self) -> bytes:
         """The bytes it was read from, or made as."""
@@ -130,6 +122,18 @@ class Signed:
 
     def __reduce__(self: _T) -> tuple[object, tuple[bytes]]:
         return type(self).from_der, (self._der,)
+
+
+def require_signature(
+    public_key: sm2.PublicKey, body: bytes, algorithm: bytes, signature: bytes, uid: bytes, what: str
+) -> None:
+    """CertificateError unless `signature` is this key's of `body` by SM2-with-SM3. algorithm: its identifier in DER."""
+    if algorithm not in _ACCEPTED:
+        raise CertificateAlgorithmError(f"{what} is not signed with SM2-with-SM3, the only algorithm supported")
+    try:
+        public_key.verify(signature, body, uid=uid)
+    except InvalidSignature:
+        raise CertificateSignatureError(f"the signature of {what} does not hold") from None
 
 
 def sign(body: bytes, key: sm2.PrivateKey, uid: bytes) -> bytes:

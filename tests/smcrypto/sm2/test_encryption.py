@@ -14,6 +14,8 @@ from smcrypto.sm2 import SM2P256V1, encryption
 from smcrypto.sm2.curve import encode_point
 from vectors_json import load
 
+pytestmark = pytest.mark.usefixtures("sm2_engine")
+
 KEY = sm2.PrivateKey.from_int(0x3945208F_7B2144B1_3F36E38A_C6D39F95_88939369_2860B51A_42FB81EF_4DF7C5B8)
 ENCODINGS = ("der", "c1c3c2", "c1c2c3")
 

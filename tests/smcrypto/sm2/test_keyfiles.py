@@ -15,8 +15,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from der_variants import overfull
-from smcrypto import InvalidKey, InvalidOption, MissingDependency, SMCryptoError, der, kdf, pem, sm2, sm3, sm4
+from der_variants import overfull, unchecked
+from smcrypto import (
+    InvalidKey,
+    InvalidOption,
+    InvalidPadding,
+    MissingDependency,
+    SMCryptoError,
+    cbc,
+    der,
+    kdf,
+    pem,
+    sm2,
+    sm3,
+    sm4,
+)
 from smcrypto.sm2 import keyfiles
 from vectors_json import load
 
@@ -148,7 +161,7 @@ def test_we_write_openssl_reads(openssl: Any, format: Any) -> None:
 
 
 def test_we_encrypt_openssl_reads(openssl: Any) -> None:
-    encrypted = keyfiles.dump_private(KEY.to_int(), POINT, b"geheim", "pkcs8", form="pem", prf="sha256")
+    encrypted = keyfiles.dump_private(KEY, b"geheim", "pkcs8", form="pem", prf="sha256")
     plain = openssl("pkey", "-passin", "pass:geheim", data=encrypted)
     assert sm2.PrivateKey.from_pem(plain) == KEY
     assert sm2.PrivateKey.from_pem(encrypted, b"geheim") == KEY
@@ -166,15 +179,17 @@ def test_the_encryption_by_another_hand() -> None:
     """hashlib and our SM4 alone, step by step after RFC 8018, 6.2.2."""
     if "sm3" not in hashlib.algorithms_available:
         pytest.skip("this Python's hashlib has no SM3")
-    info = der.Reader(KEY.to_der(password=b"geheim")).sequence()
+    info = unchecked(KEY.to_der(password=b"geheim")).sequence()
     scheme = info.sequence()
     assert scheme.oid() == "1.2.840.113549.1.5.13"
     both = scheme.sequence()
-    derivation, cipher = both.sequence(), both.sequence()
+    derivation = both.sequence()
     assert derivation.oid() == "1.2.840.113549.1.5.12"
     parameters = derivation.sequence()
     salt, iterations = parameters.octet_string(), parameters.integer()
     assert len(salt) == 16 and iterations == keyfiles.ITERATIONS
+    parameters.rest()
+    cipher = both.sequence()
     cipher.oid()
     key = hashlib.pbkdf2_hmac("sm3", b"geheim", salt, iterations, 16)
     plain = sm4.decrypt(key, sm4.CBC(cipher.octet_string()), info.octet_string(), padding="pkcs7")
@@ -402,17 +417,9 @@ def test_writing_refuses_what_makes_no_sense() -> None:
     with pytest.raises(TypeError):
         KEY.to_pem(password="pw")  # type: ignore[arg-type]
     with pytest.raises(InvalidOption, match="prf"):
-        keyfiles.dump_private(1, POINT, b"pw", "pkcs8", form="der", prf="md5")  # type: ignore[arg-type]
+        keyfiles.dump_private(KEY, b"pw", "pkcs8", form="der", prf="md5")  # type: ignore[arg-type]
     with pytest.raises(InvalidOption, match="iterations"):
-        keyfiles.dump_private(1, POINT, b"pw", "pkcs8", form="der", iterations=0)
-    for call in (
-        lambda: keyfiles.dump_private(1, POINT, None, "pkcs8", form="txt"),  # type: ignore[arg-type]
-        lambda: keyfiles.dump_public(POINT, form="txt"),  # type: ignore[arg-type]
-        lambda: keyfiles.load_private(b"", None, form="txt"),  # type: ignore[arg-type]
-        lambda: keyfiles.load_public(b"", form="txt"),  # type: ignore[arg-type]
-    ):
-        with pytest.raises(InvalidOption, match="form must be"):
-            call()
+        keyfiles.dump_private(KEY, b"pw", "pkcs8", form="der", iterations=0)
 
 
 # --- encrypted keys that are refused ---
@@ -578,6 +585,19 @@ def test_scrypt_as_hashlib_computes_it(N: int, r: int, p: int) -> None:
             sm2.PrivateKey.from_der(variant, b"pw")
 
 
+def test_scrypt_with_just_as_much_memory_and_work_as_are_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    key = hashlib.scrypt(b"pw", salt=b"salt", n=16, r=2, p=3, dklen=16)
+    ciphertext = sm4.encrypt(key, sm4.CBC(bytes(16)), KEY.to_der(), padding="pkcs7")
+    data = encrypted(derivation=scrypt(16, 2, 3), ciphertext=ciphertext)
+    for name, most in (("MAX_SCRYPT_MEMORY", 128 * 16 * 2), ("MAX_SCRYPT_BLOCKS", 16 * 2 * 3)):
+        with monkeypatch.context() as patch:
+            patch.setattr(keyfiles, name, most)
+            assert sm2.PrivateKey.from_der(data, b"pw") == KEY
+            patch.setattr(keyfiles, name, most - 1)
+            with pytest.raises(InvalidKey, match="the limits are"):
+                sm2.PrivateKey.from_der(data, b"pw")
+
+
 @pytest.mark.parametrize("oid", ["2.16.840.1.101.3.4.1.2", "1.2.840.113549.3.7"])
 @pytest.mark.parametrize("ciphertext", [bytes(16), bytes(range(32))])
 def test_foreign_ciphers_refuse_bad_padding(oid: str, ciphertext: bytes) -> None:
@@ -597,7 +617,7 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(builtins, "__import__", without)
     data = encrypted(cipher_oid="2.16.840.1.101.3.4.1.42", ciphertext=bytes(16))
-    with pytest.raises(MissingDependency, match="encrypted with AES; reading it needs the package 'cryptography'"):
+    with pytest.raises(MissingDependency, match="AES needs the package 'cryptography'"):
         sm2.PrivateKey.from_der(data, b"pw")
 
 
@@ -607,10 +627,10 @@ def test_aes_is_read_where_the_package_is_too_old_for_triple_des(monkeypatch: py
     padded = KEY.to_der() + bytes([16 - len(KEY.to_der()) % 16]) * (16 - len(KEY.to_der()) % 16)
     encryptor = ciphers.Cipher(ciphers.algorithms.AES(key), ciphers.modes.CBC(bytes(16))).encryptor()
     data = encrypted(cipher_oid="2.16.840.1.101.3.4.1.42", ciphertext=encryptor.update(padded))
-    monkeypatch.setitem(sys.modules, "cryptography.hazmat.decrepit.ciphers.algorithms", None)
+    monkeypatch.setitem(sys.modules, "cryptography.hazmat.decrepit.ciphers", None)
     assert sm2.PrivateKey.from_der(data, b"pw") == KEY
     triple = encrypted(cipher_oid="1.2.840.113549.3.7", iv=bytes(8), ciphertext=bytes(16))
-    with pytest.raises(MissingDependency, match="encrypted with TripleDES"):
+    with pytest.raises(MissingDependency, match="TripleDES needs"):
         sm2.PrivateKey.from_der(triple, b"pw")
 
 
@@ -691,7 +711,7 @@ def test_keys_are_encrypted_and_read_without_openssl(prf: Any, monkeypatch: pyte
         assert sm2.PrivateKey.from_pem(written_with, b"password") == KEY
         assert sm2.PrivateKey.from_pem(KEY.to_pem(b"password", prf=prf), b"password") == KEY
     else:
-        sealed = keyfiles.dump_private(KEY.to_int(), POINT, b"password", "pkcs8", form="pem", prf=prf, iterations=10)
+        sealed = keyfiles.dump_private(KEY, b"password", "pkcs8", form="pem", prf=prf, iterations=10)
         assert sm2.PrivateKey.from_pem(sealed, b"password") == KEY
 
 
@@ -707,3 +727,84 @@ def test_without_openssl_scrypt_is_a_missing_dependency(monkeypatch: pytest.Monk
     monkeypatch.delattr(hashlib, "scrypt")
     with pytest.raises(MissingDependency, match="OpenSSL"):
         sm2.PrivateKey.from_der(encrypted(derivation=scrypt(16, 8, 1)), b"pw")
+
+
+# --- keys of other algorithms beside ours ---
+
+
+def _foreign(openssl: Callable[..., bytes]) -> dict[str, bytes]:
+    rsa = openssl("genpkey", "-algorithm", "RSA", "-pkeyopt", "rsa_keygen_bits:1024")
+    p256 = openssl("ecparam", "-name", "prime256v1", "-genkey")  # EC PARAMETERS and EC PRIVATE KEY
+    return {
+        "RSA": rsa,
+        "RSA, PKCS#1": openssl("rsa", "-traditional", data=rsa),
+        "RSA, encrypted": openssl("pkcs8", "-topk8", "-v2", "aes256", "-passout", "pass:theirs", data=rsa),
+        "RSA, encrypted with our password": openssl("pkcs8", "-topk8", "-passout", "pass:ours", data=rsa),
+        "RSA, encrypted by PBES1": openssl("pkcs8", "-topk8", "-v1", "PBE-SHA1-3DES", "-passout", "pass:x", data=rsa),
+        "RSA, encrypted in the old way": openssl("rsa", "-traditional", "-aes128", "-passout", "pass:x", data=rsa),
+        "P-256": p256,
+        "P-256, encrypted in the old way": openssl("ec", "-aes128", "-passout", "pass:x", data=p256),
+        "P-384": openssl("ecparam", "-name", "secp384r1", "-genkey", "-noout"),
+        "Ed25519": openssl("genpkey", "-algorithm", "Ed25519"),
+    }
+
+
+@pytest.mark.parametrize("password", [None, b"ours"])
+def test_the_sm2_key_of_a_file_that_begins_with_other_keys_is_found(
+    openssl: Callable[..., bytes], password: bytes | None
+) -> None:
+    ours = KEY.to_pem(password, prf="sha256")
+    foreign = _foreign(openssl)
+    for name, theirs in foreign.items():
+        assert sm2.PrivateKey.from_pem(theirs + ours, password) == KEY, name
+        assert sm2.PrivateKey.from_pem(ours + theirs, password) == KEY, name
+        with pytest.raises(InvalidKey):
+            sm2.PrivateKey.from_pem(theirs, password)
+    everything = b"".join(foreign.values())
+    assert sm2.PrivateKey.from_pem(everything + ours + OTHER.to_pem(), password) == KEY
+    if password is None:
+        assert sm2.PrivateKey.from_pem(foreign["P-256"] + KEY.to_pem(format="sec1")) == KEY
+    else:
+        with pytest.raises(InvalidKey, match="the password is wrong"):
+            sm2.PrivateKey.from_pem(ours + everything, b"no")
+        with pytest.raises(InvalidKey, match="a password is needed"):
+            sm2.PrivateKey.from_pem(foreign["RSA"] + ours)
+
+
+def test_the_sm2_public_key_of_a_file_that_begins_with_another_is_found(openssl: Callable[..., bytes]) -> None:
+    theirs = openssl("pkey", "-pubout", data=openssl("genpkey", "-algorithm", "Ed25519"))
+    assert sm2.PublicKey.from_pem(theirs + KEY.public_key.to_pem()) == KEY.public_key
+    with pytest.raises(InvalidKey, match=r"algorithm is 1\.3\.101\.112, not SM2"):
+        sm2.PublicKey.from_pem(theirs)
+
+
+def test_a_malformed_key_is_not_passed_over() -> None:
+    broken = pem.encode("PRIVATE KEY", WRONG_PRIVATE["a public key of another private key inside"])
+    with pytest.raises(InvalidKey, match="of another key"):
+        sm2.PrivateKey.from_pem(broken + KEY.to_pem())
+    with pytest.raises(InvalidKey, match="no END line"):
+        sm2.PrivateKey.from_pem(KEY.to_pem() + OTHER.to_pem()[:-9])
+
+
+def test_the_work_of_all_keys_in_a_file_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    sealed = KEY.to_pem(b"pw", prf="sha256")
+    monkeypatch.setattr(keyfiles, "MAX_ITERATIONS", 2 * keyfiles.ITERATIONS)
+    with pytest.raises(InvalidKey, match="the password is wrong"):
+        sm2.PrivateKey.from_pem(2 * sealed, b"other")
+    with pytest.raises(InvalidKey, match="the keys ask for 300000 iterations in all; the limit is 200000"):
+        sm2.PrivateKey.from_pem(3 * sealed, b"other")
+
+
+@pytest.mark.parametrize("cipher", [cbc.AES256, cbc.TRIPLE_DES])
+@pytest.mark.parametrize("size", [0, 1, 7, 8, 15, 16])
+def test_padding_of_every_size_in_other_ciphers_than_ours(cipher: cbc.CBC, size: int) -> None:
+    """PKCS#7 of 1 byte and of a whole block are the ends that a slip moves (RFC 5652, 6.3)."""
+    pytest.importorskip("cryptography")
+    key, iv, plain = bytes(range(cipher.key_length)), bytes(cipher.block), bytes(range(size))
+    padded = cipher.decrypt(key, iv, cipher.encrypt(key, iv, plain))
+    count = cipher.block - size % cipher.block
+    assert padded == plain + bytes([count]) * count and cipher.unpadded(padded) == plain
+    whole = bytes([cipher.block]) * cipher.block
+    for bad in (padded[:-1] + b"\0", whole[:-1] + bytes([cipher.block + 1]), b"\1" + whole[1:]):
+        with pytest.raises(InvalidPadding):
+            cipher.unpadded(bad)

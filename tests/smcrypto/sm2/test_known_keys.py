@@ -22,6 +22,10 @@ WIDTH_3 = 4 * 8  # points of a comb of that width: rows, and both signs of four 
 POINTS = [reference.multiple(k, TINY_1009.G, TINY_1009) for k in range(1, 40)]
 
 
+def with_combs(memory: KnownKeys) -> list[tuple[int, int]]:
+    return [P for (_, P), record in memory._records.items() if record.comb]
+
+
 def use(memory: KnownKeys, P, times: int, curve=TINY_1009) -> None:
     for _ in range(times):
         memory.used(curve, P)
@@ -40,7 +44,7 @@ def test_a_key_earns_a_comb_by_being_used():
     assert comb is memory.comb(TINY_1009, P)
     use(memory, P, 5)
     assert comb is memory.comb(TINY_1009, P)
-    assert len(memory) == 1
+    assert len(with_combs(memory)) == 1
 
 
 def test_a_key_used_much_earns_a_wider_comb():
@@ -52,7 +56,7 @@ def test_a_key_used_much_earns_a_wider_comb():
         widths.append(comb and comb.width)
         use(memory, P, 1)
     assert widths == [None, None, 3, 3, 3, 6, 6, 6]
-    assert len(memory) == 1
+    assert len(with_combs(memory)) == 1
 
 
 def test_while_one_thread_builds_a_comb_the_others_go_on(monkeypatch):
@@ -84,80 +88,66 @@ def test_the_number_of_combs_is_bounded_and_the_least_recently_used_goes():
     for P in POINTS[:3]:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
-    memory.comb(TINY_1009, POINTS[0])
-    use(memory, POINTS[3], 15)
-    assert memory.comb(TINY_1009, POINTS[3]) is None, "a comb costs more than that"
+    use(memory, POINTS[0], 1)
     use(memory, POINTS[3], 1)
     assert memory.comb(TINY_1009, POINTS[3]) is not None
-    assert len(memory) == 3
-    assert memory.comb(TINY_1009, POINTS[0]) is not None
+    assert with_combs(memory) == [POINTS[2], POINTS[0], POINTS[3]]
     assert memory.comb(TINY_1009, POINTS[1]) is None
     for P in POINTS:
-        use(memory, P, 16)
+        use(memory, P, 1)
         memory.comb(TINY_1009, P)
-        assert len(memory) == 3
+        assert len(with_combs(memory)) == 3
+    assert memory._points == 3 * WIDTH_3
 
 
-def test_keys_that_take_turns_do_not_take_each_others_combs():
-    """More keys than there is room for, in turn: those that have a comb keep it, and none is built in vain."""
-    memory = KnownKeys(stages=((2, 3),), points=3 * WIDTH_3)
-    for _ in range(20):
-        combs = []
-        for P in POINTS[:20]:
-            combs.append(memory.comb(TINY_1009, P))
-            use(memory, P, 1)
-    assert [comb is not None for comb in combs] == [True] * 3 + [False] * 17
-    use(memory, POINTS[30], 16)  # this one comes back at once, and theirs was a round ago
-    assert memory.comb(TINY_1009, POINTS[30]) is not None
-    assert memory.comb(TINY_1009, POINTS[0]) is None
-
-
-def test_keys_that_are_met_at_random_do_not_take_each_others_combs(monkeypatch):
-    memory = KnownKeys(stages=((2, 3),), points=3 * WIDTH_3)
+@pytest.mark.parametrize("order", ["in turn", "at random"])
+def test_where_keys_are_many_building_never_costs_more_than_their_uses_without_a_comb(order, monkeypatch):
+    memory = KnownKeys(stages=((5, 3),), points=3 * WIDTH_3)
     built = []
     monkeypatch.setattr(module, "Comb", lambda *arguments: built.append(arguments) or Comb(*arguments))
-    source = random.Random(1)
-    for P in source.choices(POINTS[:20], k=2000):
-        memory.comb(TINY_1009, P)
+    met = POINTS[:20] * 100 if order == "in turn" else random.Random(1).choices(POINTS[:20], k=2000)
+    without = 0
+    for P in met:
+        without += memory.comb(TINY_1009, P) is None
         use(memory, P, 1)
-    assert 3 <= len(built) <= 6
+    assert 3 <= len(built) <= without / 5
     for _ in range(20):  # the others stay away, and these three need their places
         for P in POINTS[30:33]:
             memory.comb(TINY_1009, P)
             use(memory, P, 1)
-    assert {P for _, P in memory._known} == {*POINTS[30:33]}
+    assert with_combs(memory) == POINTS[30:33]
 
 
-def full_of_narrow_combs() -> KnownKeys:
-    """Of the first three points; there is no room for more."""
+def test_a_wider_comb_takes_nobodys_place():
     memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
     for P in POINTS[:3]:
         use(memory, P, 1)
         memory.comb(TINY_1009, P)
-    return memory
-
-
-def test_a_key_that_takes_a_place_begins_with_a_narrow_comb():
-    memory = full_of_narrow_combs()
-    use(memory, POINTS[3], 99)
-    assert memory.comb(TINY_1009, POINTS[3]).width == 3
-    assert [P for _, P in memory._known] == POINTS[1:4]
-
-
-def test_a_wider_comb_takes_nobody_elses_place():
-    memory = full_of_narrow_combs()
     use(memory, POINTS[0], 9)
     assert memory.comb(TINY_1009, POINTS[0]).width == 3
-    assert len(memory) == 3
+    assert with_combs(memory) == [*POINTS[1:3], POINTS[0]]
+    memory = KnownKeys(stages=((1, 3), (4, 5)), points=3 * WIDTH_3)
+    for P in POINTS[:2]:
+        use(memory, P, 1)
+        memory.comb(TINY_1009, P)
+    use(memory, POINTS[0], 9)
+    assert memory.comb(TINY_1009, POINTS[0]).width == 5
 
 
-def test_the_number_of_candidates_is_bounded():
-    memory = KnownKeys(stages=((2, 3),), candidates=5)
+def test_a_comb_that_no_room_is_left_for_serves_once():
+    memory = KnownKeys(stages=((1, 3),), points=WIDTH_3 - 1)
+    use(memory, POINTS[0], 1)
+    assert memory.comb(TINY_1009, POINTS[0]) is not None
+    assert memory._points == 0 and not memory._records
+
+
+def test_the_number_of_keys_is_bounded():
+    memory = KnownKeys(stages=((2, 3),), keys=5)
     for _ in range(3):
         for P in POINTS[:10]:  # each forgotten before it comes round again
             use(memory, P, 1)
             assert memory.comb(TINY_1009, P) is None
-    assert len(memory._candidates) == 5
+    assert len(memory._records) == 5
 
 
 def test_only_signatures_that_hold_count(monkeypatch):
@@ -186,10 +176,10 @@ def test_results_are_the_same_before_and_after_a_key_is_known(monkeypatch):
         with pytest.raises(InvalidSignature):
             key.public_key.verify(signed, b"massage")
         side = sm2.KeyExchange(peer, b"", key.public_key, b"", initiator=True, ephemeral_key=r)
-        outcomes.add(side.agree(sm2.PrivateKey.from_int(99).public_key.to_bytes(), 16))
+        outcomes.add(side.agree(sm2.PrivateKey.from_int(99).public_key.to_bytes(), 16, unconfirmed=True))
         outcomes.add(repr(encryption.encrypt(SM2P256V1, key.public_key.point, b"message", iter([1234567]))))
     assert len(outcomes) == 2
-    assert len(memory) == 1
+    assert len(with_combs(memory)) == 1
 
 
 def test_several_threads_share_the_memory():
@@ -204,20 +194,18 @@ def test_several_threads_share_the_memory():
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, range(2000)))
-    assert 1 <= len(memory) <= 4
-    assert memory._points == sum(len(row) for known in memory._known.values() for row in known.comb.rows)
+    assert 1 <= len(with_combs(memory)) <= 4
+    assert memory._points == sum(record.points() for record in memory._records.values())
 
 
-def test_a_key_that_lost_its_comb_and_earned_another_while_a_wider_one_was_built_counts_once(monkeypatch):
+def test_a_key_that_went_and_came_back_while_its_comb_was_built_counts_once(monkeypatch):
     memory = KnownKeys(stages=((1, 3), (20, 5)), points=3 * WIDTH_3)
     P, *others = POINTS[:4]
-    built = []
 
     def slow_comb(point, width, curve):
-        built.append(width)
         if width == 5:  # meanwhile, in other threads, the others take all places, and P then one of theirs
             for Q in (*others, P):
-                use(memory, Q, 16)
+                use(memory, Q, 1)
                 memory.comb(curve, Q)
         return Comb(point, width, curve)
 
@@ -226,8 +214,8 @@ def test_a_key_that_lost_its_comb_and_earned_another_while_a_wider_one_was_built
     memory.comb(TINY_1009, P)
     use(memory, P, 19)
     assert memory.comb(TINY_1009, P).width == 5
-    assert built.count(3) == 5, "P had two narrow ones"
-    assert memory._points == sum(len(row) for known in memory._known.values() for row in known.comb.rows) <= 3 * WIDTH_3
+    assert memory._points == sum(record.points() for record in memory._records.values()) == 3 * WIDTH_3
+    assert memory.comb(TINY_1009, P).width == 3
 
 
 FORK = """

@@ -1,4 +1,4 @@
-"""The parallel engines against the standard's text, on every number of blocks where something changes."""
+"""Every engine against the standard's text, on every number of blocks where something changes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sm4_reference import reference_crypt, reference_expand_key
 from smcrypto.errors import InvalidKey
 from smcrypto.sm4 import bitslice, byteplanes, tables
-from smcrypto.sm4.block import SBOX, L, reference_crypt, reference_expand_key
+from smcrypto.sm4.block import SBOX, L
 from smcrypto.sm4.engine import BULK_BLOCKS, FEW_BLOCKS, Engine, counter_blocks, xor_bytes
+
+pytestmark = pytest.mark.usefixtures("sm4_engine")
 
 KEY = bytes.fromhex("0123456789abcdeffedcba9876543210")
 RK = reference_expand_key(KEY)
@@ -54,7 +57,7 @@ def test_bit_slices_equal_the_standard(width: int) -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 30, tables.WIDE_BLOCKS])
-def test_the_chain_equals_its_definition(sm4_engine: str, n: int) -> None:
+def test_the_chain_equals_its_definition(n: int) -> None:
     engine, previous, expected = Engine(KEY), DATA[:16], []
     for i in range(16, 16 * n + 16, 16):
         previous = reference_crypt(RK, xor_bytes(DATA[i : i + 16], previous))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import random
 from itertools import pairwise
 from types import SimpleNamespace
@@ -13,8 +14,10 @@ from hypothesis import strategies as st
 
 import smcrypto
 from smcrypto import InvalidKey, InvalidLength, InvalidOption, InvalidTag, sm4
-from smcrypto.sm4 import gcmstream
+from smcrypto.sm4 import aead, gcmstream
 from vectors_json import load
+
+pytestmark = pytest.mark.usefixtures("sm4_engine")
 
 KEY, NONCE = bytes(range(16)), bytes(12)
 RANDOM = random.Random(38)
@@ -48,17 +51,19 @@ def test_any_cut_equals_one_call(nonce: bytes, header: bytes, size: int, tag_len
         assert b"".join([*pieces, stream.finalize()]) == data
 
 
-def test_long_messages_and_a_counter_that_wraps() -> None:
+def test_long_messages_and_a_counter_that_wraps(monkeypatch: pytest.MonkeyPatch) -> None:
     data = RANDOM.randbytes(100_003)
     for nonce in (NONCE, b"n" * 100):
         cipher = sm4.Cipher(KEY, sm4.GCM(nonce))
         stream = cipher.encryptor()
         sealed = b"".join([stream.update(data[i : i + 999]) for i in range(0, len(data), 999)] + [stream.finalize()])
         assert sealed == sm4.SM4GCM(KEY).encrypt(nonce, data)
-    state = gcmstream._State(KEY, NONCE, b"")
-    state._counter = NONCE + b"\xff\xff\xff\xfe"
-    assert state.xor(bytes(48)) == sm4.SM4(KEY).encrypt_block(NONCE + b"\xff" * 4) + b"".join(
-        sm4.SM4(KEY).encrypt_block(NONCE + bytes([0, 0, 0, i])) for i in (0, 1))  # inc32, SP 800-38D, 6.2
+    J_0 = NONCE + b"\xff\xff\xff\xfe"
+    expected = sm4.SM4(KEY).encrypt_block(NONCE + b"\xff" * 4) + b"".join(
+        sm4.SM4(KEY).encrypt_block(NONCE + bytes([0, 0, 0, i])) for i in range(3))  # inc32, SP 800-38D, 6.2
+    monkeypatch.setattr(sm4.SM4GCM, "_J_0", lambda self, nonce: J_0)
+    state = gcmstream._Python(KEY, NONCE, b"")
+    assert b"".join(state.open(bytes(n)) for n in (16, 20, 0, 28)) == expected
 
 
 @pytest.mark.parametrize("early", [False, True])
@@ -77,7 +82,50 @@ def test_every_flipped_bit_is_noticed(early: bool) -> None:
             sm4.decrypt(KEY, cipher.mode, short)
 
 
-def test_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bound_of_a_message_holds_for_all_its_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """2^39 - 256 bits: SP 800-38D, 5.2.1.1. The bound itself is still taken."""
+    assert aead.GCM_TEXT == (2**39 - 256) // 8
+    sealed = sm4.encrypt(KEY, sm4.GCM(NONCE), bytes(21))
+    monkeypatch.setattr(aead, "GCM_TEXT", 20)
+    whole = sm4.encrypt(KEY, sm4.GCM(NONCE), bytes(20))
+    cipher = sm4.Cipher(KEY, sm4.GCM(NONCE))
+    stream = cipher.encryptor()
+    assert stream.update(bytes(13)) + stream.update(bytes(7)) == whole[:20]
+    with pytest.raises(InvalidLength, match=r"2\^36 - 32 bytes.*21"):
+        stream.update(b"x")
+    for early in (False, True):
+        stream = cipher.decryptor(release_unverified=early)
+        assert stream.update(whole[:19]) + stream.update(whole[19:]) + stream.finalize() == bytes(20)
+        stream = cipher.decryptor(release_unverified=early)
+        with pytest.raises(InvalidLength):
+            stream.update(sealed[:30]), stream.update(sealed[30:]), stream.finalize()
+
+
+def test_a_nonce_object_serves_one_encryption_and_any_number_of_decryptions() -> None:
+    mode = sm4.GCM(NONCE, b"header")
+    sealed = sm4.encrypt(KEY, mode, b"message")
+    cipher = sm4.Cipher(KEY, mode)
+    for again in (cipher.encryptor, lambda: sm4.encrypt(KEY, mode, b"other"), copy.copy(cipher).encryptor,
+                  sm4.Cipher(bytes(16), copy.copy(mode)).encryptor):  # fmt: skip
+        with pytest.raises(smcrypto.OutOfOrder, match="another nonce"):
+            again()
+    for _ in range(3):
+        assert sm4.decrypt(KEY, mode, sealed) == b"message"
+    cipher = sm4.Cipher(KEY, sm4.GCM(NONCE))
+    cipher.encryptor()
+    with pytest.raises(smcrypto.OutOfOrder):
+        cipher.encryptor()
+    assert mode == sm4.GCM(NONCE, b"header") and hash(mode) == hash(sm4.GCM(NONCE, b"header"))
+    assert repr(mode) == repr(sm4.GCM(NONCE, b"header"))
+    mode = sm4.GCM(NONCE)
+    copies = [copy.deepcopy(mode), copy.deepcopy({"mode": mode})["mode"], copy.copy(mode)]
+    sm4.encrypt(KEY, mode, b"message")
+    for one in copies:
+        with pytest.raises(smcrypto.OutOfOrder):
+            sm4.encrypt(KEY, one, b"other")
+
+
+def test_what_does_not_fit() -> None:
     calls: list[tuple[Any, type[Exception]]] = [
         (lambda: sm4.GCM(b""), InvalidLength), (lambda: sm4.GCM(NONCE, tag_length=11), InvalidLength),
         (lambda: sm4.GCM(NONCE, b"", 17), InvalidLength), (lambda: sm4.GCM("n"), TypeError),
@@ -89,9 +137,6 @@ def test_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     for call, error in calls:
         with pytest.raises(error):
             call()
-    monkeypatch.setattr(gcmstream, "GCM_TEXT", 20)
-    with pytest.raises(InvalidLength):
-        sm4.encrypt(KEY, sm4.GCM(NONCE), bytes(21))
     stream = sm4.Cipher(KEY, sm4.GCM(NONCE)).encryptor()
     stream.finalize()
     with pytest.raises(smcrypto.AlreadyFinalized):

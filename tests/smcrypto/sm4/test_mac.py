@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sm4_reference import reference_crypt, reference_expand_key
 from smcrypto import InvalidKey, InvalidLength, InvalidOption, sm4
-from smcrypto.sm4.block import reference_crypt, reference_expand_key
 
 pytestmark = pytest.mark.usefixtures("sm4_engine")
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from der_variants import overfull
+from der_variants import overfull, unchecked
 from smcrypto import CertificateError, InvalidKey, InvalidLength, InvalidOption, SMCryptoError, der, pem, sm2, sm3, x509
 from smcrypto.x509 import Certificate, CertificateSigningRequest, Extension, Name
 from vectors_json import load
@@ -110,9 +110,16 @@ def test_certificates_do_not_change_and_can_be_pickled() -> None:
             dataclasses.replace(thing, signature=b"")
 
 
-def test_a_copied_request_is_to_be_verified_again() -> None:
-    again = pickle.loads(pickle.dumps(CSR))
-    assert again == CSR and CSR.verified and not again.verified
+def test_verifying_a_request_does_not_change_it() -> None:
+    """Of two equal requests both are issued for, or none."""
+    made = CertificateSigningRequest.create(KEY, subject={"CN": "x"}, uid=b"robot")
+    read = CertificateSigningRequest.from_der(made.to_der())
+    made.verify(uid=b"robot")
+    for request in (made, read, pickle.loads(pickle.dumps(made))):
+        assert request == made
+        with pytest.raises(x509.CertificateSignatureError):
+            x509.issue(request, ROOT.certificate, ROOT.key, **TIMES)
+        assert x509.issue(request, ROOT.certificate, ROOT.key, **TIMES, request_uid=b"robot")
 
 
 def test_serial_numbers_are_random_positive_and_fit_20_bytes() -> None:
@@ -133,7 +140,7 @@ def test_a_bundle_of_certificates() -> None:
 
 def test_the_signature_covers_the_bytes_received() -> None:
     """A name out of UTF8String that we would write as PrintableString is verified as it stands."""
-    body = der.Reader(CERTIFICATE.tbs_certificate).sequence()
+    body = unchecked(CERTIFICATE.tbs_certificate).sequence()
     fields = [body.raw() for _ in range(8)]
     fields[3] = der.sequence(der.set_of(der.sequence(der.oid("2.5.4.3"), der.element(der.T61_STRING, b"root"))))
     certificate = ROOT.resigned(der.sequence(*fields))
@@ -152,9 +159,7 @@ def test_a_request_says_what_was_put_in() -> None:
     assert again.subject_alt_names == ("URI:urn:rosbridge-eth:robot:robot_1", "DNS:robot.example")
     assert again.key_usage == {"digitalSignature"} and again.extended_key_usage == ("clientAuth", "1.2.3.4")
     assert [a.oid for a in again.attributes] == ["1.2.840.113549.1.9.14"] and len(again.extensions) == 3
-    assert CSR.verified and not again.verified
     again.verify()
-    assert again.verified
     assert repr(again) == "<CertificateSigningRequest CN=robot_1,O=舰队,C=CN>"
 
 
@@ -174,7 +179,6 @@ def test_a_request_under_another_uid() -> None:
         x509.issue(csr, ROOT.certificate, ROOT.key, **TIMES)
     assert x509.issue(csr, ROOT.certificate, ROOT.key, **TIMES, request_uid=b"robot")
     csr.verify(uid=b"robot")
-    x509.issue(csr, ROOT.certificate, ROOT.key, **TIMES).verify_signature(ROOT.certificate)
     with pytest.raises(InvalidLength):
         csr.verify(uid=bytes(8192))
 
@@ -237,6 +241,7 @@ def test_requests_as_others_write_them() -> None:
     request_of(attributes=None).verify()
     several = sorted([attribute(EXTENSION_REQUEST, SAN), attribute(EXTENSION_REQUEST, SKI)])
     assert len(request_of(attributes=der.explicit(0, *several)).extensions) == 2
+    assert request_of(attributes=der.explicit(0, attribute(EXTENSION_REQUEST, der.sequence()))).extensions == ()
     challenge = attribute("1.2.840.113549.1.9.7", der.utf8_string("secret"))
     assert request_of(attributes=der.explicit(0, challenge)).attributes == (
         ("1.2.840.113549.1.9.7", (der.utf8_string("secret"),)),
@@ -251,7 +256,6 @@ def test_requests_as_others_write_them() -> None:
         {"attributes": der.explicit(0, attribute("1.2.3"))},
         {"attributes": der.explicit(0, attribute(EXTENSION_REQUEST, SAN, SKI))},
         {"attributes": der.explicit(0, attribute(EXTENSION_REQUEST, SAN), attribute(EXTENSION_REQUEST, SAN))},
-        {"attributes": der.explicit(0, attribute(EXTENSION_REQUEST, der.sequence()))},
         {"attributes": der.explicit(0, attribute(EXTENSION_REQUEST, der.sequence(
             Extension("2.5.29.15", True, b"\x03\x01\x00").to_der())))},
         {"attributes": der.explicit(1)},
@@ -264,6 +268,24 @@ def test_requests_that_are_malformed(parts: dict[str, Any]) -> None:
 
 
 # --- what issuing refuses ---
+
+
+def test_what_is_no_ca_issues_nothing() -> None:
+    no_ca = Holder(KEY, CERTIFICATE)
+    crl_signer = ROOT.ca("crl", key_usage=("cRLSign",))
+    old = Holder(KEY, certificate_of(version=b""))  # version 1: no basic constraints
+    for holder, reason in (
+        (no_ca, "CN=robot_1,O=舰队,C=CN is not a CA"), (old, "CN=x is not a CA"),
+        (crl_signer, "CN=crl may not sign certificates"),
+    ):  # fmt: skip
+        with pytest.raises(x509.CertificateUsageError, match=reason):
+            x509.issue(CSR, holder.certificate, holder.key, **TIMES)
+
+
+def test_nothing_is_issued_beyond_the_ca_s_own_end() -> None:
+    with pytest.raises(InvalidOption, match=r"not_after lies after 2027-06-01 .*, when the CA's"):
+        issue(not_after=END + timedelta(seconds=1))
+    assert issue(not_after=END + timedelta(microseconds=999999)).not_after == END == ROOT.certificate.not_after
 
 
 def test_the_ca_key_must_be_that_of_the_ca_certificate() -> None:
@@ -367,16 +389,17 @@ def test_the_ca_may_choose_another_subject() -> None:
 
 
 def test_times_of_any_zone_are_written_in_utc() -> None:
-    c = issue(
-        not_before=datetime(2026, 1, 1, 8, tzinfo=EAST), not_after=datetime(2055, 1, 1, 0, 0, 0, 999999, tzinfo=UTC)
-    )
+    c = x509.self_signed(
+        KEY, subject="CN=x",
+        not_before=datetime(2026, 1, 1, 8, tzinfo=EAST), not_after=datetime(2055, 1, 1, 0, 0, 0, 999999, tzinfo=UTC),
+    )  # fmt: skip
     assert c.not_before == datetime(2026, 1, 1, tzinfo=UTC)
     assert c.not_after == datetime(2055, 1, 1, tzinfo=UTC)
     assert b"\x18\x0f20550101000000Z" in c.to_der()
 
 
 def test_a_ca_without_key_identifier() -> None:
-    body = der.Reader(ROOT.certificate.tbs_certificate).sequence()
+    body = unchecked(ROOT.certificate.tbs_certificate).sequence()
     fields = [body.raw() for _ in range(7)]
     kept = [e.to_der() for e in ROOT.certificate.extensions if e.oid in ("2.5.29.19", "2.5.29.15")]
     bare = Holder(ROOT.key, ROOT.resigned(der.sequence(*fields, der.explicit(3, der.sequence(*kept)))))
@@ -439,21 +462,14 @@ MALFORMED = {
     "extensions in version 2": {
         "version": der.explicit(0, der.integer(1)), "extensions": (Extension("1.2.3", False, der.null()),)},
     "unique identifiers in version 1": {"version": b"", "ids": der.implicit(1, b"\0\1")},
-    "a negative serial number": {"serial": der.integer(-1)},
     "two algorithms": {"algorithm": der.sequence(der.oid("1.2.840.10045.4.3.2"))},
     "an empty issuer": {"issuer": der.sequence()},
-    "GeneralizedTime before 2050": {"validity": der.sequence(der.generalized_time(BEGIN), der.time(END))},
     "three times": {"validity": der.sequence(der.time(BEGIN), der.time(END), der.time(END))},
-    "a key of P-256": {"spki": P256},
     "a key off the curve": {"spki": KEY.public_key.to_der()[:-1] + bytes([KEY.public_key.to_der()[-1] ^ 1])},
     "something after the extensions": {"tail": der.null()},
-    "an empty list of extensions": {"tail": der.explicit(3, der.sequence())},
     "two lists of extensions": {"tail": der.explicit(3, der.null(), der.null())},
     "an extension twice": {"extensions": (Extension("1.2.3", False, b""), Extension("1.2.3", True, b""))},
-    "critical spelt out": {"extensions": (CRITICAL_SPELT_OUT,)},
     "an extension with a tail": {"extensions": (der.sequence(der.oid("1.2.3"), der.octet_string(b""), der.null()),)},
-    "CA spelt out": {"extensions": (CA_SPELT_OUT,)},
-    "a path length for no CA": {"extensions": (Extension("2.5.29.19", True, der.sequence(der.integer(0))),)},
     "a negative path length": {
         "extensions": (Extension("2.5.29.19", True, der.sequence(der.boolean(True), der.integer(-1))),)},
     "bytes after basic constraints": {"extensions": (Extension("2.5.29.19", True, der.sequence() + b"\0"),)},
@@ -474,8 +490,147 @@ MALFORMED = {
 
 @pytest.mark.parametrize("case", MALFORMED)
 def test_certificates_that_are_malformed(case: str) -> None:
-    with pytest.raises(CertificateError, match="not a valid certificate"):
+    with pytest.raises(x509.CertificateMalformedError, match="not a valid certificate"):
         certificate_of(**MALFORMED[case])
+
+
+def test_a_key_of_another_curve_is_named() -> None:
+    with pytest.raises(x509.CertificateAlgorithmError, match="the key of CN=x is EC P-256, not SM2"):
+        certificate_of(spki=P256)
+
+
+POLICIES = der.sequence(der.sequence(der.oid("1.2.3")))
+# What is odd: the certificate, the sentence that says it, what openssl prints, and what it means all the same.
+ODD: dict[str, tuple[dict[str, Any], str, str, Callable[[Certificate], bool]]] = {
+    "key usage with zero bits at its end": (
+        {"extensions": (Extension("2.5.29.15", True, bytes.fromhex("030200c0")),)}, "keyUsage ends in zero bits",
+        "Digital Signature, Non Repudiation\n", lambda c: c.key_usage == {"digitalSignature", "nonRepudiation"}),
+    "key usage of a byte too many": (
+        {"extensions": (Extension("2.5.29.15", True, bytes.fromhex("0303008000")),)}, "keyUsage ends in zero bits",
+        "Digital Signature\n", lambda c: c.key_usage == {"digitalSignature"}),
+    "GeneralizedTime at the beginning": (
+        {"validity": der.sequence(der.generalized_time(BEGIN), der.time(END))}, "a date through 2049 is not a UTCTime",
+        "Not Before: May 31 12:00:00 2026 GMT", lambda c: (c.not_before, c.not_after) == (BEGIN, END)),
+    "GeneralizedTime at the end": (
+        {"validity": der.sequence(der.time(BEGIN), der.generalized_time(END))}, "a date through 2049 is not a UTCTime",
+        "Not After : Jun  1 12:00:00 2027 GMT", lambda c: (c.not_before, c.not_after) == (BEGIN, END)),
+    "an empty list of extensions": (
+        {"tail": der.explicit(3, der.sequence())}, "the list of extensions is empty", "Version: 3",
+        lambda c: c.extensions == ()),
+    "a negative serial number": (
+        {"serial": der.integer(-5)}, "the serial number is not positive", "Serial Number: -5 (-0x5)",
+        lambda c: c.serial_number == -5),
+    "serial number 0": (  # RFC 5280, 4.1.2.2 wants readers prepared for both
+        {"serial": der.integer(0)}, "the serial number is not positive", "Serial Number: 0 (0x0)",
+        lambda c: c.serial_number == 0),
+    "a serial number of 21 bytes": (
+        {"serial": der.integer(2**159)}, "or longer than 20 bytes", "80:00:00:00:00",
+        lambda c: c.serial_number == 2**159),
+    "CA:FALSE spelt out": (
+        {"extensions": (CA_SPELT_OUT,)}, "basicConstraints spells out its default", "CA:FALSE",
+        lambda c: c.basic_constraints == x509.BasicConstraints(False)),
+    "a path length without CA": (
+        {"extensions": (Extension("2.5.29.19", True, der.sequence(der.integer(3))),)},
+        "has a path length, but not for a CA", "CA:FALSE, pathlen:3",
+        lambda c: c.basic_constraints == x509.BasicConstraints(False, 3)),
+    "critical spelt out": (
+        {"extensions": (CRITICAL_SPELT_OUT,)}, "an extension spells out that it is not critical", "1.2.3:",
+        lambda c: c.extensions == (Extension("1.2.3", False, der.null()),)),
+    "critical policies": (
+        {"extensions": (Extension("2.5.29.32", True, POLICIES),)}, "certificatePolicies is critical", "Policy: 1.2.3",
+        lambda c: c.extensions[0].critical),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_what_is_odd_is_read_said_and_refused_by_a_strict_judge(case: str) -> None:
+    parts, sentence, _, means = ODD[case]
+    c = certificate_of(**parts)
+    assert len(c.oddities) == 1 and sentence in c.oddities[0]
+    assert means(c)
+    assert x509.verify_chain(c, roots=[ROOT.certificate], at=NOW) == (c, ROOT.certificate)
+    with pytest.raises(x509.CertificateMalformedError, match=f"CN=x is odd: .*{sentence}"):
+        x509.verify_chain(c, roots=[ROOT.certificate], at=NOW, strict=True)
+    with pytest.raises(x509.CertificateMalformedError, match="CN=x is odd"):
+        x509.verify_chain(c, roots=[c], at=NOW, strict=True)
+
+
+def test_several_oddities_are_all_said() -> None:
+    usage = Extension("2.5.29.15", True, bytes.fromhex("030200c0"))
+    spelt = Extension("2.5.29.19", True, der.sequence(der.boolean(False), der.integer(0)))
+    c = certificate_of(
+        serial=der.integer(-1), validity=der.sequence(der.generalized_time(BEGIN), der.time(END)),
+        extensions=(CRITICAL_SPELT_OUT, usage, spelt, Extension("2.5.29.32", True, POLICIES)),
+    )  # fmt: skip
+    assert len(c.oddities) == 7 == len(set(c.oddities))
+
+
+def test_what_we_write_is_not_odd() -> None:
+    late = root("r", path_length=0, not_after=datetime(2050, 1, 1, tzinfo=UTC), serial_number=2**159 - 1).certificate
+    policies = certificate_of(extensions=(Extension("2.5.29.32", False, POLICIES),))
+    for c in (CERTIFICATE, ROOT.certificate, late, certificate_of(version=b""), policies):
+        assert c.oddities == ()
+    assert len(x509.verify_chain(CERTIFICATE, roots=[ROOT.certificate], at=NOW, strict=True)) == 2
+
+
+def test_an_odd_issuer_is_refused_by_a_strict_judge() -> None:
+    odd_ca = Holder(KEY, certificate_of(extensions=(
+        Extension("2.5.29.19", True, der.sequence(der.boolean(True))), Extension("2.5.29.32", True, POLICIES))))
+    leaf = odd_ca.issue("leaf").certificate
+    options = {"intermediates": [odd_ca.certificate], "roots": [ROOT.certificate], "at": NOW}
+    assert len(x509.verify_chain(leaf, **options)) == 3
+    with pytest.raises(x509.CertificateMalformedError, match="CN=x is odd: certificatePolicies"):
+        x509.verify_chain(leaf, **options, strict=True)
+
+
+def test_a_negative_serial_number_can_be_revoked() -> None:
+    c = certificate_of(serial=der.integer(-5))
+    entry = der.sequence(der.integer(-5), der.time(NOW))
+    body = der.sequence(der.integer(1), der.sequence(der.oid("1.2.156.10197.1.501")), ROOT.certificate.subject.to_der(),
+                        der.time(NOW), der.time(END), der.sequence(entry))  # fmt: skip
+    signed = der.sequence(body, der.sequence(der.oid("1.2.156.10197.1.501")), der.bit_string(ROOT.key.sign(body)))
+    with pytest.raises(x509.CertificateRevokedError):
+        x509.verify_chain(c, roots=[ROOT.certificate], at=NOW, crls=[x509.CertificateRevocationList.from_der(signed)])
+
+
+def test_a_ca_of_negative_serial_number_is_named_by_it() -> None:
+    ca = Holder(KEY, certificate_of(serial=der.integer(-5), extensions=(
+        Extension("2.5.29.19", True, der.sequence(der.boolean(True))),)))
+    for serial, length in ((b"\xfb", 3), (b"\x05", 0)):
+        named = Extension("2.5.29.35", False, der.sequence(der.implicit(2, serial)))
+        with der.reading_sequence(CERTIFICATE.tbs_certificate) as body:
+            fields = [body.raw() for _ in range(8)]
+        leaf = ca.resigned(der.sequence(*fields[:3], ca.certificate.subject.to_der(), *fields[4:7],
+                                        der.explicit(3, der.sequence(named.to_der()))))  # fmt: skip
+        options = {"intermediates": [ca.certificate], "roots": [ROOT.certificate], "at": NOW}
+        if length:
+            assert len(x509.verify_chain(leaf, **options)) == length
+        else:
+            with pytest.raises(x509.CertificateUnknownIssuerError):
+                x509.verify_chain(leaf, **options)
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_openssl_reads_the_same_out_of_what_is_odd(case: str, openssl: Callable[..., bytes]) -> None:
+    parts, _, printed, _ = ODD[case]
+    assert printed in openssl("x509", "-noout", "-text", data=certificate_of(**parts).to_pem()).decode()
+
+
+@pytest.mark.filterwarnings("ignore:Parsed a serial number which wasn't positive")
+def test_cryptography_reads_the_same_out_of_what_is_odd() -> None:
+    theirs = pytest.importorskip("cryptography.x509")
+    agreed = 0
+    for parts, _, _, _ in ODD.values():
+        ours = certificate_of(**parts)
+        try:
+            read = theirs.load_der_x509_certificate(ours.to_der())
+            extensions = [(e.oid.dotted_string, e.critical) for e in read.extensions]
+        except (ValueError, theirs.UnsupportedGeneralNameType):  # stricter than we are
+            continue
+        agreed += 1
+        assert (read.serial_number, read.not_valid_before_utc) == (ours.serial_number, ours.not_before)
+        assert extensions == [(e.oid, e.critical) for e in ours.extensions]
+    assert agreed >= 4
 
 
 def test_no_container_takes_anything_more() -> None:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from der_variants import unchecked
 from smcrypto import CertificateError, InvalidOption, InvalidSignature, der, sm2, x509
 from vectors_json import load
 from x509_authority import BEGIN, END, NOW, Holder, certificates, root
@@ -63,9 +64,29 @@ def without_extension(holder: Holder, oid: str) -> x509.Certificate:
 
 def with_extensions(holder: Holder, extensions: list[x509.Extension], signer: Holder) -> x509.Certificate:
     """The certificate with other extensions, signed again by its issuer."""
-    body = der.Reader(holder.certificate.tbs_certificate).sequence()
+    body = unchecked(holder.certificate.tbs_certificate).sequence()
     fields = [body.raw() for _ in range(7)]
     return signer.resigned(der.sequence(*fields, der.explicit(3, der.sequence(*(e.to_der() for e in extensions)))))
+
+
+@pytest.mark.parametrize(
+    ("error", "make"),
+    [
+        (x509.CertificateExpiredError, lambda: verify(LEAF, SUB, at=END + timedelta(seconds=1))),
+        (x509.CertificateNotYetValidError, lambda: verify(LEAF, SUB, at=BEGIN - timedelta(seconds=1))),
+        (x509.CertificateUnknownIssuerError, lambda: verify(LEAF)),
+        (x509.CertificateUnknownIssuerError, lambda: verify(LEAF, SUB, roots=[])),
+        (x509.CertificateUsageError, lambda: verify(LEAF, SUB, key_usage="keyAgreement")),
+        (x509.CertificateUsageError, lambda: verify(SUB.issue("s", extended_key_usage=["serverAuth"]), SUB,
+                                                    extended_key_usage="clientAuth")),
+        (x509.CertificateSignatureError, lambda: verify(LEAF, SUB, uid=b"another")),
+        (x509.CertificateRevokedError, lambda: verify(LEAF, SUB, crls=[SUB.crl(LEAF)])),
+    ],
+)  # fmt: skip
+def test_each_reason_has_its_error(error: type[CertificateError], make) -> None:
+    with pytest.raises(CertificateError) as raised:
+        make()
+    assert type(raised.value) is error
 
 
 # --- trust ---
@@ -94,7 +115,7 @@ def test_what_is_trusted_is_the_certificate_not_its_name() -> None:
 
 def test_an_issuer_without_ca_basic_constraints() -> None:
     end_entity = ROOT.issue("end entity", key_usage=("keyCertSign",))
-    refused("CN=end entity is not a CA", end_entity.issue("leaf"), end_entity)
+    refused("CN=end entity is not a CA", end_entity.forge("leaf"), end_entity)
 
 
 def test_an_issuer_without_basic_constraints() -> None:
@@ -105,22 +126,22 @@ def test_an_issuer_without_basic_constraints() -> None:
 
 def test_a_root_that_is_not_a_ca() -> None:
     not_ca = root("plain", ca=False)
-    refused("CN=plain is not a CA", not_ca.issue("leaf"), roots=[not_ca])
+    refused("CN=plain is not a CA", not_ca.forge("leaf"), roots=[not_ca])
 
 
 def test_a_version_1_root() -> None:
     key = sm2.PrivateKey.generate()
-    template = der.Reader(root("v1", key=key).certificate.tbs_certificate).sequence()
+    template = unchecked(root("v1", key=key).certificate.tbs_certificate).sequence()
     template.raw()
     body = der.sequence(*(template.raw() for _ in range(6)))
     old = Holder(key, Holder(key, ROOT.certificate).resigned(body))
     assert old.certificate.version == 1 and old.certificate.extensions == ()
-    refused("CN=v1 is not a CA", old.issue("leaf"), roots=[old])
+    refused("CN=v1 is not a CA", old.forge("leaf"), roots=[old])
 
 
 def test_an_issuer_without_key_cert_sign() -> None:
     ca = ROOT.ca("crl signer", key_usage=("cRLSign", "digitalSignature"))
-    refused("no keyCertSign", ca.issue("leaf"), ca)
+    refused("no keyCertSign", ca.forge("leaf"), ca)
 
 
 def test_an_issuer_without_key_usage_at_all_may_sign() -> None:
@@ -188,12 +209,12 @@ def test_both_ends_of_validity_belong_to_it(at: datetime) -> None:
 
 def test_an_expired_intermediate() -> None:
     old = ROOT.ca("old", not_after=NOW - timedelta(seconds=1))
-    refused("CN=old expired", old.issue("leaf"), old)
+    refused("CN=old expired", old.forge("leaf"), old)
 
 
 def test_an_expired_root() -> None:
     old = root("old root", not_after=NOW - timedelta(seconds=1))
-    refused("CN=old root expired", old.issue("leaf"), roots=[old])
+    refused("CN=old root expired", old.forge("leaf"), roots=[old])
 
 
 @pytest.mark.parametrize("at", [datetime(2026, 6, 1), NOW.replace(tzinfo=None)])
@@ -241,9 +262,13 @@ def test_name_constraints_are_refused_because_they_are_not_applied(critical: boo
     refused("critical extension|name constraints", ca.issue("leaf", subject_alt_names=["DNS:example.org"]), ca)
 
 
-def test_critical_policies_are_refused_because_they_are_not_applied() -> None:
+def test_critical_policies_are_allowed_and_constraints_of_policies_are_not() -> None:
+    """RFC 5280, 6.1.1 c and e: with any-policy accepted and none required, policies alone never fail a path."""
     policies = x509.Extension("2.5.29.32", True, der.sequence(der.sequence(der.oid("1.2.3"))))
-    refused(r"critical extension 2\.5\.29\.32", ROOT.issue("leaf", extensions=[policies]))
+    assert len(verify(ROOT.issue("leaf", extensions=[policies]))) == 2
+    required = x509.Extension("2.5.29.36", True, der.sequence(der.implicit(0, b"\0")))
+    ca = ROOT.ca("ca", extensions=[policies, required])
+    refused(r"critical extension 2\.5\.29\.36", ca.issue("leaf"), ca)
 
 
 # --- names and key identifiers ---
@@ -322,7 +347,7 @@ SM2_WITH_SM3 = der.sequence(der.oid("1.2.156.10197.1.501"))
 
 def test_an_unsupported_signature_algorithm() -> None:
     body = LEAF.certificate.tbs_certificate.replace(SM2_WITH_SM3, ECDSA_WITH_SHA256)
-    certificate = SUB.resigned(der.sequence(der.Reader(body).sequence() and _content(body)), ECDSA_WITH_SHA256)
+    certificate = SUB.resigned(der.sequence(unchecked(body).sequence() and _content(body)), ECDSA_WITH_SHA256)
     refused("not signed with SM2-with-SM3", certificate, SUB)
 
 
