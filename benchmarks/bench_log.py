@@ -126,7 +126,7 @@ def rows(records: list[bytes], size: int, seconds: float) -> Iterator[tuple[str,
             cost(lambda i, level=level: zstd.compress(contents[i], level)),  # type: ignore[misc]
             length([zstd.compress(content, level) for content in contents]),
         )
-    plaintexts = [chunks._pack(group, True, chunks.LEVEL, False) for group in some]
+    plaintexts = [chunks._pack(group, True, chunks.LEVEL) for group in some]
     yield "SM4-GCM", cost(lambda i: sm4.SM4GCM(key).encrypt(bytes(12), plaintexts[i], bytes(88))), length(plaintexts)
     yield "signature", cost(lambda i: ROBOT.sign(bytes(400), encoding="raw")), 64 / size
     for readers in (1, 2, 16):

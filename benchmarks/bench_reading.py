@@ -1,20 +1,17 @@
 """Reading and proving a history: records a second, and what of it takes the time.
 
     python benchmarks/bench_reading.py [--chunks 1000] [--records 100]
-    python benchmarks/bench_reading.py --kept 150000        chunks of 10 records, as a robot at 10 Hz has in 42 hours
+    python benchmarks/bench_reading.py --records 10         as a robot at 10 Hz has
 
 The records are the sample's Odometry, pose and twist (as in bridge_costs.py) and then whole messages; the chunks are
 sealed as a robot seals them, and read as the chain gives them, from memory: nodes and networks are not measured here.
-With --kept the chunks are taken for proven, kept, and asked for again; their numbers change from record to record.
+With facts: as a reading that finds what an earlier one has proven in the reader's home.
 """
 
 from __future__ import annotations
 
 import argparse
 import platform
-import random
-import re
-import resource
 import tempfile
 import time
 import tracemalloc
@@ -22,20 +19,18 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from itertools import cycle, islice
 from pathlib import Path
-from typing import Any
 
 from eth_hash.auto import keccak
 
 from bridge_costs import POSE_AND_TWIST
-from rosbridge_eth.capture import Capture, MessageLine, TopicRule, parse_line, stream_line
+from rosbridge_eth.capture import Capture, TopicRule, parse_line, stream_line
 from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.reading.cache import Cache, open_cache
-from rosbridge_eth.reading.verdict import Progress
-from rosbridge_eth.reading.verify import Choice, Place, ProvenChunk, ProvenRecord, Verifier, is_signed
+from rosbridge_eth.reading.memo import Memo
+from rosbridge_eth.reading.verify import Facts, Verifier, is_signed
 from rosbridge_eth.sources import BagSource, Selection, sample_bag
-from smcrypto import sm2, sm3
+from smcrypto import sm3
 
 START = datetime(2026, 1, 1, tzinfo=UTC)
 T0_MS = round(START.timestamp() * 1000) + 3_600_000
@@ -52,62 +47,11 @@ def sample_lines(fields: Sequence[str] = ()) -> tuple[list[bytes], list[bytes]]:
     return opening, [one.line for one in captured]
 
 
-def kept(chunks: int, folder: Path) -> None:
-    """What it costs to keep proven records, and to ask for them again."""
-    reader, trust, log = sm2.PrivateKey.generate(), Trust([]), Log(LEDGER, robot_id(NAME))
-    parts = re.split(rb"(?<=\d\.\d)(\d+)", sample_lines()[1][0])
-    number = random.Random(1)
-
-    def opened() -> Cache:
-        cache = open_cache(folder, NAME, log, reader, trust, {})
-        if cache is None:
-            raise SystemExit(f"nothing can be kept in {folder}")
-        return cache
-
-    chunk: Any = None  # of which nothing is kept
-    cache = opened()
-    took = -time.process_time()
-    for index in range(chunks):
-        place = Place(index, b"s" * 16, index, number.randbytes(32), index + 1, T0_MS // 1000 + index, b"t" * 32)
-        records = []
-        for n in range(10):
-            parts[1::2] = [b"%03d" % number.randrange(1000) + part[3:] for part in parts[1::2]]
-            message = MessageLine("/robot_1/odom", TYPE, "ros1", (T0_MS + 1000 * index + 100 * n) * 10**6, 0, True, {})
-            records.append(ProvenRecord(place, n, b"".join(parts), message, None))
-        cache.add(ProvenChunk(place, chunk, b"", (), tuple(records)))
-        cache.links.add(place.digest, index)
-        if cache.full or index == chunks - 1:
-            cache.commit(Progress(index + 1, records=10 * index + 10), index + 2, index + 1, b"")
-    cache.close()
-    took += time.process_time()
-    size = sum(path.stat().st_size for path in folder.iterdir())
-    print(f"{took / chunks * 1e5:8.1f} us a record kept; {size / chunks / 10:.1f} bytes a record on the disk")
-    t0 = T0_MS * 10**6
-    for name, choice in (
-        ("opened, and nothing asked for", Choice("/none")),
-        ("the last record", Choice(at_ns=2**62)),
-        ("ten minutes", Choice(from_ns=t0 + 3600 * 10**9, to_ns=t0 + 4200 * 10**9)),
-        ("all of the topic", Choice("/robot_1/odom")),
-    ):
-        took = -time.process_time()
-        cache = opened()
-        found = sum(1 for _ in cache.records(choice, set()))
-        cache.close()
-        took += time.process_time()
-        print(f"{took:8.2f} s: {name}, {found:,} records of {cache.progress.records:,}")
-    print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:8.0f} MiB at most, all of the process")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--chunks", type=int, default=1000)
     parser.add_argument("--records", type=int, default=100)
-    parser.add_argument("--kept", type=int)
     arguments = parser.parse_args()
-    if arguments.kept:
-        with tempfile.TemporaryDirectory() as folder:
-            kept(arguments.kept, Path(folder, "proven"))
-        return
     for what, fields in (("pose and twist", POSE_AND_TWIST), ("whole messages", ())):
         proven(what, fields, arguments.chunks, arguments.records)
 
@@ -132,10 +76,10 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
     standing = Standing(ACCOUNT, keccak(certificates), False, len(encoded), keccak(encoded[-1]), 0, 9, 1)
     registered = [RegistrationEvent(ACCOUNT, certificates, 0, 0, 1, False)]
 
-    def read() -> int:
+    def read(facts: Facts | None = None) -> int:
         verifier = Verifier(
             NAME, LEDGER, standing, registered, trust=Trust([authority.certificate]), reader=reader, block=9,
-            block_time=lambda block: T0_MS // 1000 + count, now=T0_MS / 1000,
+            block_time=lambda block: T0_MS // 1000 + count, now=T0_MS / 1000, facts=facts,
         )  # fmt: skip
         events = (DataEvent(at, 0, tuple(encoded[at : at + 8]), 9, b"", ACCOUNT) for at in range(0, len(encoded), 8))
         records = sum(len(read_chunk.records) for read_chunk in verifier.read(events))
@@ -153,6 +97,16 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
         records = read()
         took = time.process_time() - begin
         print(f"{records / took:8,.0f} records a second, {name}: {took / records * 1e6:.1f} us each, {took:.2f} s")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "facts.sqlite")
+        for name in ("facts written", "facts read"):
+            begin = time.process_time()
+            facts = Memo(file, reader)
+            read(facts)
+            facts.close()
+            took = time.process_time() - begin
+            print(f"{records / took:8,.0f} records a second, {name}: {took / records * 1e6:.1f} us each, {took:.2f} s")
+        print(f"{file.stat().st_size / count:8.0f} bytes a chunk on the disk")
     for name, step in (
         ("SM3 of 1 KiB, for comparison", lambda chunk: sm3.digest(bytes(1024))),
         ("signature", lambda chunk: is_signed(log, robot.signing_key.public_key, chunk)),

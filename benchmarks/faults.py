@@ -248,6 +248,7 @@ class Site:
         if redis:
             self.start_redis()
             settings += f'\n[store]\nurl = "redis://127.0.0.1:{self.redis_port}/0"\n'
+        settings += "\n[funds]\ngas_per_day = 1_000_000_000_000\n"  # a month's records in an hour
         self.home.config.write_text(f'monitor = "127.0.0.1:{self.monitor_port}"\n{settings}')
         self.start_node()
         self.command("deploy", *self._passphrase)

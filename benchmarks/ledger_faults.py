@@ -236,7 +236,7 @@ def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
     store = SqliteInbox(Path(inbox), bytes.fromhex(ledger), 10**9, 10**8)
     writer = submitter.Submitter(
         Ledger(url, contract, timeout=5), store, keys.keys, keys.get, KEYS.operator,
-        submitter.Settings(confirmations=CONFIRMATIONS),
+        submitter.Settings(confirmations=CONFIRMATIONS, gas_per_day=10**12),
     )  # fmt: skip
     said = None
     while True:

@@ -202,7 +202,10 @@ class Operator:
             listen=listen, public="127.0.0.1:7410", chain_url=where,
             keys=keys,
         )
-        more = f'confirmations = {confirmations}\n\n[store]\nurl = "{self._open_store(folder, store)}"\n{settings}'
+        store_url = self._open_store(folder, store)
+        more = f'confirmations = {confirmations}\n\n[store]\nurl = "{store_url}"\n{settings}'
+        if "[funds]" not in settings:
+            more += "\n[funds]\ngas_per_day = 1_000_000_000_000\n"
         with self.home.config.open("a") as file:
             file.write(more)
         self.config = load_server_config(self.home.config)

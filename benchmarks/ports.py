@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
+import fcntl
 import random
 import socket
+import tempfile
+from pathlib import Path
+from typing import IO
+
+_reserved: list[IO[bytes]] = []  # open for as long as this process lives, and locked so long
 
 
 def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    """A port below those that the kernel gives out by itself, so that nobody gets it before it is used."""
+    """A port that no other process which asks here is given, and below those that the kernel gives out by itself.
+
+    Between the choice and its use seconds may pass: a lock on a file of the port's name keeps the processes of a
+    parallel test run apart.
+    """
+    folder = Path(tempfile.gettempdir()) / "rosbridge_eth-ports"
+    folder.mkdir(exist_ok=True)
     while True:
         port = random.SystemRandom().randrange(20_000, 32_000)
-        with socket.socket(socket.AF_INET, kind) as probe:
-            try:
+        file = (folder / str(port)).open("wb")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with socket.socket(socket.AF_INET, kind) as probe:
                 probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
+        except OSError:
+            file.close()
+            continue
+        _reserved.append(file)
+        return port

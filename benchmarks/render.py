@@ -86,12 +86,12 @@ def rate(timing: Timing) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The comparison as a Markdown table under a line that names machine, versions and engine."""
+    """The comparison as a Markdown table under a line that names machine, versions and engines."""
     machine = report["machine_info"]
     lines = [
         f"Measured {report['datetime'][:10]} on {machine['cpu'].get('brand_raw', machine['machine'])}, "
         f"{machine['python_implementation']} {machine['python_version']}, "
-        f"SM3 engine: {machine.get('sm3_engine', 'unknown')}. Medians; every ratio is from this one run.",
+        f"{machine.get('engines', 'engines unknown')}. Medians; every ratio is from this one run.",
         "",
         "| what | smcrypto | rate | beside | ratio |",
         "| --- | ---: | ---: | --- | ---: |",

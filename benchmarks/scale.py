@@ -47,8 +47,8 @@ ASSUMED = (
     + ", ".join(f"{name} {gas / 1e6:.1f}" for name, gas in CHAINS.items())
     + ". Ethereum: 60 M gas in 12 s; the rollup: 60 M gas in 2 s, a round figure.",
     "Gas is that of the submitter's formula, which is above what the EVM takes by a tenth or so.",
-    f"Anchored: header and signature alone, {HEADER} bytes a chunk, as with `store = \"archive\"`; or one"
-    f" `setRoot` a robot and minute, {SET_ROOT_GAS:,} gas, which is designed and not built.",
+    f"Anchored: header and signature alone, {HEADER} bytes a chunk; or one `setRoot` a robot and minute,"
+    f" {SET_ROOT_GAS:,} gas. Neither is built.",
 )  # fmt: skip
 
 

@@ -3,8 +3,9 @@
     python benchmarks/size.py [--files] [SOURCE_FOLDER]
 
 Counted are the lines on which a token of the program stands, so that a statement over five lines is five
-lines; a docstring is any string that stands alone. The script that runs inside Redis is told apart (Lua lines
-without blank ones and comments); the contract and generated files (JSON) are not counted.
+lines; a docstring is any string that stands alone. JavaScript (files, the scripts within pages, and the reader in
+docs/verify.mjs) and Lua are lines without blank ones and comments, told apart and in the sum. The contract, style
+sheets, markup and generated files (JSON) are not counted.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ from __future__ import annotations
 import argparse
 import ast
 import io
+import re
 import tokenize
 from collections import Counter
 from pathlib import Path
 
 SOURCES = Path(__file__).resolve().parent.parent / "src"
 LARGEST_FILE = 400
+BESIDE = {".js": "JavaScript", ".mjs": "JavaScript", ".html": "JavaScript", ".lua": "Lua"}
+"""Languages that are counted beside Python, by a file's ending."""
 
 PARTS = {
     "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py", "terminal.py"),
@@ -54,10 +58,15 @@ def _docstring_lines(source: str) -> set[int]:
 
 
 def code_lines(path: Path) -> int:
-    """Lines of code of one Python or Lua file."""
+    """Lines of code of one file, by its ending."""
     source = path.read_text()
-    if path.suffix == ".lua":
-        return sum(1 for line in source.splitlines() if line.strip() and not line.strip().startswith("--"))
+    if path.suffix == ".html":
+        source = "\n".join(re.findall(r"<script>(.*?)</script>", source, re.DOTALL))
+    if path.suffix != ".py":
+        comment = "--" if path.suffix == ".lua" else "//"
+        if comment == "//":
+            source = re.sub(r"^\s*/\*.*?\*/", "", source, flags=re.DOTALL | re.MULTILINE)
+        return sum(1 for line in source.splitlines() if line.strip() and not line.strip().startswith(comment))
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in _NO_CODE:
@@ -91,8 +100,14 @@ def main() -> None:
         if parts[part]:
             print(f"{parts[part]:7,}  {part}")
     print(f"{sum(bridge.values()):7,}  rosbridge_eth, {len(bridge)} files")
-    for path in sorted(package.rglob("*.lua")):
-        print(f"{code_lines(path):7,}  {path.relative_to(package)}, beside")
+    beside = {path: code_lines(path) for path in [*package.rglob("*"), arguments.sources.parent / "docs/verify.mjs"]
+              if path.suffix in BESIDE and path.exists()}  # fmt: skip
+    for path, lines in sorted(beside.items()):
+        if arguments.files and lines:
+            print(f"{lines:7,}  {path.relative_to(arguments.sources.parent)}")
+    for name in sorted({*BESIDE.values()}):
+        print(f"{sum(lines for path, lines in beside.items() if BESIDE[path.suffix] == name):7,}  {name}")
+    print(f"{sum(bridge.values()) + sum(beside.values()):7,}  all of the bridge")
     print(f"{sum(library.values()):7,}  smcrypto, {len(library)} files")
 
 

@@ -33,7 +33,7 @@ PAGES = {
 }
 """A file or folder of the repository, and its page; those in docs/ keep their names."""
 MODULES = ("smcrypto", *(f"smcrypto.{name}" for name in
-           ("sm2", "sm3", "sm4", "kdf", "x509", "cms", "pkcs12", "pem", "der")))  # fmt: skip
+           ("sm2", "sm3", "sm4", "kdf", "x509", "cms", "tls", "pkcs12", "pem", "der")))  # fmt: skip
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
 _FENCE = re.compile(r"(?m)^```(\w+) +(.+)$")
 

@@ -1,17 +1,20 @@
 // Reads a robot's log from a chain and proves it, independently of rosbridge_eth: written from docs/log.md alone,
 // on ethers (the chain), sm-crypto-v2 (SM2, SM3, SM4) and fzstd (Zstandard).
 //
-//   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX] [--archive FOLDER]
+//   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX]
+//
+// It does what docs/reading.md and docs/log.md say of one reading at one node. It leaves what outlives a reading or needs
+// more than one node: bookmarks (so no `rolled-back`, `elsewhere` and `new-certificate`), the comparison of nodes
+// (`contradicted`), grants that another reader made, and whether the chain was reorganised meanwhile.
 //
 // --key is the reader's private encryption key, 32 bytes in hex; without it everything but the content is checked. It is
 //   sm2.PrivateKey.from_pem(open("enc.key.pem", "rb").read(), password=b"…").to_bytes().hex() in smcrypto.
-// --archive is a folder with the bodies of archived chunks, or a copy of it; without it they are not looked at.
 // Proven records go to stdout as JSON lines, the verdict as one JSON object to stderr. Exit code 0: sound; 9: not.
 
-import { existsSync, readFileSync } from 'node:fs'
+import { readFileSync } from 'node:fs'
 import { parseArgs } from 'node:util'
 import { Contract, JsonRpcProvider, id as keccakOfText, getBytes, keccak256 } from 'ethers'
-import { decompress } from 'fzstd'
+import { Decompress } from 'fzstd'
 import { sm2, sm3, sm4 } from 'sm-crypto-v2'
 
 const ABI = [
@@ -23,7 +26,7 @@ const ABI = [
   'event Revoked(bytes32 indexed Tk, address indexed account, uint256 index, uint256 previousBlock)',
 ]
 const SPAN = 2000 // blocks asked for at once
-const MAX = { body: 65536, archived: 1 << 24, readers: 16, records: 1000, plaintext: 4 << 20 }
+const MAX = { body: 65536, readers: 16, records: 1000, plaintext: 4 << 20, line: 60 << 10, depth: 100, block: 128 << 10 }
 const FIXED = 1 + 1 + 16 + 8 + 32 + 8 + 4 + 32 + 4 + 32 + 1
 const GRANT = 8 + 113
 const ZEROS = '00'.repeat(32)
@@ -56,12 +59,16 @@ class Wrong extends Error {
 
 // --- X.509 (RFC 5280), as far as it is needed
 
+// One value. DER's lengths have one form (X.690, 10.1).
 function element(der, at) {
   let length = der[at + 1]
   let start = at + 2
   if (length >= 0x80) {
     start += length & 0x7f
-    length = Number(number(der.slice(at + 2, start)))
+    const size = der.slice(at + 2, start)
+    if (size.length < 1 || size.length > 3 || size[0] === 0) throw new Wrong('untrusted', 'a certificate is not DER')
+    length = Number(number(size))
+    if (length < 0x80) throw new Wrong('untrusted', 'a certificate is not DER')
   }
   const end = start + length
   if (!(end <= der.length)) throw new Wrong('untrusted', 'a certificate ends early')
@@ -74,41 +81,81 @@ function members(content) {
   return found
 }
 
+const SM2_WITH_SM3 = '06082a811ccf55018375'
+const SM2_KEY = '301306072a8648ce3d020106082a811ccf5501822d'
+const [ROBOT, ANY] = ['2b06010505070302', '551d2500'] // clientAuth, anyExtendedKeyUsage
+const HARMLESS = new Set(['551d0e', '551d20', '551d23']) // identifiers of keys, and policies: any is taken
+const bits = (part) => part.content.slice(1)
+
 function certificate(der) {
-  const [signed, , signature] = members(element(der, 0).content)
-  const parts = members(signed.content).filter((part) => part.tag !== 0xa0) // without the version
-  const [, , issuer, validity, subject, keyInfo, ...rest] = parts
+  const [signed, algorithm, signature] = members(element(der, 0).content)
+  const [version, , inner, issuer, validity, subject, keyInfo, ...rest] = members(signed.content)
+  if (version.tag !== 0xa0 || hex(version.content) !== '020102') throw new Wrong('untrusted', 'not of version 3')
+  const [kind, point] = members(keyInfo.content)
+  const sm2Alone = [algorithm, inner].every((used) => hex(members(used.content)[0].whole) === SM2_WITH_SM3)
+  if (!sm2Alone || hex(kind.whole) !== SM2_KEY) throw new Wrong('untrusted', 'not of SM2 and SM3')
   const [from, until] = members(validity.content).map(({ tag, content }) => {
     const t = Buffer.from(content).toString('latin1')
     const full = tag === 0x17 ? (t < '50' ? '20' : '19') + t : t
     return Date.parse(full.replace(/^(....)(..)(..)(..)(..)(..)Z$/, '$1-$2-$3T$4:$5:$6Z'))
   })
-  const names = []
-  for (const { tag, content } of rest.filter((part) => part.tag === 0xa3)) {
+  const found = {
+    signed: signed.whole, signature: bits(signature), issuer: hex(issuer.whole), subject: hex(subject.whole),
+    key: hex(bits(point)), from, until, names: [], authority: false, usage: null, purposes: null, size: element(der, 0).end,
+  }
+  const there = new Set()
+  for (const { content } of rest.filter((part) => part.tag === 0xa3)) {
     for (const extension of members(members(content)[0].content)) {
-      const [oid, ...values] = members(extension.content)
-      if (hex(oid.content) !== '551d11') continue // subjectAltName
-      for (const name of members(members(values.at(-1).content)[0].content)) {
-        names.push(`${name.tag & 0x1f}:${Buffer.from(name.content).toString('latin1')}`)
+      const parts = members(extension.content)
+      const [id, value] = [hex(parts[0].content), element(parts.at(-1).content, 0)]
+      if (there.has(id)) throw new Wrong('untrusted', 'an extension is there twice')
+      there.add(id)
+      if (id === '551d13') found.authority = members(value.content).some((part) => part.tag === 1 && part.content[0])
+      else if (id === '551d0f') found.usage = bits(value)[0] // digitalSignature 80 … keyAgreement 08, keyCertSign 04
+      else if (id === '551d25') found.purposes = members(value.content).map((part) => hex(part.content))
+      else if (id === '551d11') {
+        for (const name of members(value.content)) {
+          found.names.push(`${name.tag & 0x1f}:${Buffer.from(name.content).toString('latin1')}`)
+        }
+      } else if (!HARMLESS.has(id) && parts.length > 2 && parts[1].content[0]) {
+        throw new Wrong('untrusted', `a critical extension, ${id}`)
       }
     }
   }
-  return {
-    signed: signed.whole, signature: signature.content.slice(1), issuer: hex(issuer.whole), subject: hex(subject.whole),
-    key: hex(members(keyInfo.content)[1].content.slice(1)), from, until, names, size: element(der, 0).end,
+  found.constrained = there.has('551d1e') // nameConstraints
+  return found
+}
+
+// The first of two values, or all that there is where it is not two.
+function firstOf(certificates) {
+  try {
+    const { whole, end } = element(certificates, 0)
+    return element(certificates, end).end === certificates.length ? whole : certificates
+  } catch {
+    return certificates
   }
 }
 
-// The signing certificate of a registration, if the CA signed it for this robot and it had not ended then. That it
-// begins later than its block is a chain whose clock is behind.
+// The signing certificate of a registration, if the table of log.md (Certificates) holds for both and they had not ended
+// then. That they begin later than its block is a chain whose clock is behind.
 function signer(certificates, roots, robot, blockTime) {
-  const made = certificate(certificates)
-  const root = roots.find((one) => one.subject === made.issuer && holds(one.key, made.signed, made.signature, true))
-  if (!root) throw new Wrong('untrusted', 'not signed by the CA')
-  if (made.names.join() !== `6:urn:rosbridge-eth:robot:${robot}`) throw new Wrong('untrusted', `for ${made.names}`)
-  const at = Math.max(blockTime * 1000, made.from, root.from)
-  if (at > made.until || at > root.until) throw new Wrong('untrusted', 'had ended when it was registered')
-  return made
+  const first = certificate(certificates)
+  const second = certificate(certificates.slice(first.size))
+  if (first.size + second.size !== certificates.length) throw new Wrong('untrusted', 'not two certificates')
+  const at = Math.max(blockTime * 1000, first.from, second.from)
+  const until = Math.min(first.until, second.until)
+  if (!(at <= until)) throw new Wrong('untrusted', 'had ended when they were registered')
+  for (const [made, own, others] of [[first, 0x80, 0x38], [second, 0x08, 0x80]]) {
+    const issued = (root) => root.subject === made.issuer && root.authority && !root.constrained &&
+      root.from <= at && at <= root.until && (root.usage === null || root.usage & 0x04) &&
+      (root.purposes === null || root.purposes.some((use) => [ROBOT, ANY].includes(use))) &&
+      holds(root.key, made.signed, made.signature, true)
+    if (!roots.some(issued)) throw new Wrong('untrusted', 'not signed by the CA')
+    if (made.names.join() !== `6:urn:rosbridge-eth:robot:${robot}`) throw new Wrong('untrusted', `for ${made.names}`)
+    if (!(made.usage & own) || made.usage & others) throw new Wrong('untrusted', 'for another use')
+    if (!made.purposes?.includes(ROBOT) || made.authority) throw new Wrong('untrusted', 'for another purpose')
+  }
+  return { ...first, from: Math.max(first.from, second.from), until }
 }
 
 // --- chunks
@@ -119,7 +166,7 @@ function parse(data) {
   const take = (size) => data.slice(at, (at += size))
   const [version, flags] = take(2)
   const header = {
-    goodbye: Boolean(flags & 1), archived: Boolean(flags & 2), stream: take(16), number: number(take(8)), previous: hex(take(32)),
+    goodbye: flags === 1, stream: take(16), number: number(take(8)), previous: hex(take(32)),
     sealed: Number(number(take(8))), records: Number(number(take(4))), root: hex(take(32)),
     bodyLength: Number(number(take(4))), bodyDigest: hex(take(32)), grants: [],
   }
@@ -130,11 +177,11 @@ function parse(data) {
   const signature = take(64)
   const body = data.slice(at)
   const empty = header.records === 0
-  const formed = version === 2 && flags <= 3 && signature.length === 64 && header.sealed < 253402300800000 &&
+  const formed = version === 2 && flags <= 1 && signature.length === 64 && header.sealed < 253402300800000 &&
     (body.length === 0 || body.length === header.bodyLength) && (empty
-    ? !header.archived && header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
+    ? header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
     : header.records <= MAX.records && count >= 1 && count <= MAX.readers && header.bodyLength > 16 &&
-      header.bodyLength <= (header.archived ? MAX.archived : MAX.body) && (header.bodyLength - 16) % 64 === 0)
+      header.bodyLength <= MAX.body && (header.bodyLength - 16) % 64 === 0)
   if (!formed) throw new Wrong('malformed')
   return { header, signature, body, bare: header.bodyLength > 0 && body.length === 0 }
 }
@@ -165,41 +212,135 @@ function open({ header, body }, log, readerKey) {
     const plaintext = sm4.decrypt(body.slice(0, -16), key, {
       mode: 'gcm', iv: new Uint8Array(12), associatedData: join(log, place), tag: body.slice(-16), output: 'array',
     })
-    const end = frameEnd(plaintext)
-    const padding = plaintext.slice(end)
-    if (padding.length >= 64 || padding.some((byte) => byte)) throw new Error('no padding')
-    const content = Buffer.from(decompress(plaintext.slice(0, end)))
-    if (content.length > (header.archived ? MAX.archived : MAX.plaintext) || content.at(-1) !== 10) throw new Error('no lines')
+    const content = unpacked(plaintext)
+    if (content.at(-1) !== 10 || content[0] === 10 || content.includes('\n\n')) throw new Error('an empty record')
     lines = []
     for (let at = 0, end; at < content.length; at = end + 1) lines.push(content.subarray(at, (end = content.indexOf(10, at))))
   } catch (error) {
     throw new Wrong('unopenable', error.message)
   }
+  if (lines.length !== header.records) throw new Wrong('unopenable', 'another number of records')
   const salt = (n) => hmac(key, bigEndian(n, 4)).slice(0, 16)
   const found = root(lines.map((line, n) => digest([0], salt(n), line)))
-  if (lines.length !== header.records || found !== header.root) throw new Wrong('unopenable', 'another root')
+  if (found !== header.root) throw new Wrong('unopenable', 'another root')
   return lines
 }
 
-// Where the Zstandard frame ends (RFC 8878, 3.1.1): a frame does not say so, its blocks do. Zeros follow it.
-function frameEnd(data) {
+// What one Zstandard frame holds (RFC 8878, 3.1.1), with zeros up to 64 bytes behind it: within 4 MiB of window and content,
+// without a dictionary, of the size and with the checksum that it says it has. Where it ends its blocks say.
+function unpacked(data) {
   if (hex(data.slice(0, 4)) !== '28b52ffd') throw new Error('no frame')
   const descriptor = data[4]
-  const single = (descriptor >> 5) & 1
-  let at = 5 + (single ? 0 : 1) + [0, 1, 2, 4][descriptor & 3] + [single, 2, 4, 8][descriptor >> 6]
+  const [single, checked, size] = [(descriptor >> 5) & 1, (descriptor >> 2) & 1, [0, 2, 4, 8][descriptor >> 6]]
+  if (descriptor & 8) throw new Error('a reserved bit')
+  const little = (from, length) => number(data.slice(from, from + length).reverse())
+  let at = 5
+  const [exponent, mantissa] = single ? [0, 0] : [10 + (data[at] >> 3), data[at++] & 7]
+  let window = 2 ** exponent * (1 + mantissa / 8)
+  const dictionary = [0, 1, 2, 4][descriptor & 3]
+  if (dictionary && little(at, dictionary)) throw new Error('a dictionary')
+  at += dictionary
+  const sizes = size || single
+  const length = Number(little(at, sizes)) + (size === 2 ? 256 : 0)
+  at += sizes
+  if (single) window = length
+  if (window > MAX.plaintext) throw new Error('a window above 4 MiB')
+  const most = Math.min(window, MAX.block)
   for (let last = 0; !last;) {
     if (at + 3 > data.length) throw new Error('the frame has no end')
-    const block = data[at] | (data[at + 1] << 8) | (data[at + 2] << 16)
-    last = block & 1
-    at += 3 + (((block >> 1) & 3) === 1 ? 1 : block >> 3)
+    const [block, kind] = [Number(little(at, 3)) >> 3, (data[at] >> 1) & 3]
+    last = data[at] & 1
+    if (kind === 3 || block > most) throw new Error('no block')
+    at += 3 + (kind === 1 ? 1 : block)
   }
-  return at + ((descriptor >> 2) & 1 ? 4 : 0)
+  const end = at + (checked ? 4 : 0)
+  const padding = data.slice(end)
+  if (end > data.length || padding.length >= 64 || padding.some((byte) => byte)) throw new Error('no padding')
+  const parts = []
+  let total = 0
+  new Decompress((part) => {
+    total += part.length
+    if (total > MAX.plaintext) throw new Error('more than 4 MiB')
+    parts.push(Buffer.from(part))
+  }).push(data.slice(0, end), true)
+  const content = Buffer.concat(parts)
+  if (sizes && content.length !== length) throw new Error('another size')
+  if (checked && (xxh64(content) & 0xffffffffn) !== little(at, 4)) throw new Error('another checksum')
+  return content
+}
+
+// XXH64 with seed 0 (xxHash, "XXH64 algorithm description"), of which a frame's checksum is the lower half.
+function xxh64(data) {
+  const [p1, p2, p3, p4, p5] = [
+    0x9e3779b185ebca87n, 0xc2b2ae3d27d4eb4fn, 0x165667b19e3779f9n, 0x85ebca77c2b2ae63n, 0x27d4eb2f165667c5n]
+  const u64 = (x) => BigInt.asUintN(64, x)
+  const turn = (x, n) => u64((x << n) | (x >> (64n - n)))
+  const round = (sum, lane) => u64(turn(u64(sum + lane * p2), 31n) * p1)
+  let at = 0
+  let hash = p5
+  if (data.length >= 32) {
+    const v = [u64(p1 + p2), p2, 0n, u64(-p1)]
+    for (; at + 32 <= data.length; at += 32) v.forEach((one, n) => (v[n] = round(one, data.readBigUInt64LE(at + 8 * n))))
+    hash = u64(turn(v[0], 1n) + turn(v[1], 7n) + turn(v[2], 12n) + turn(v[3], 18n))
+    for (const one of v) hash = u64((hash ^ round(0n, one)) * p1 + p4)
+  }
+  hash = u64(hash + BigInt(data.length))
+  for (; at + 8 <= data.length; at += 8) hash = u64(turn(hash ^ round(0n, data.readBigUInt64LE(at)), 27n) * p1 + p4)
+  for (; at + 4 <= data.length; at += 4) hash = u64(turn(hash ^ u64(BigInt(data.readUInt32LE(at)) * p1), 23n) * p2 + p3)
+  for (; at < data.length; at++) hash = u64(turn(hash ^ u64(BigInt(data[at]) * p5), 11n) * p1)
+  hash = u64((hash ^ (hash >> 33n)) * p2)
+  hash = u64((hash ^ (hash >> 29n)) * p3)
+  return hash ^ (hash >> 32n)
+}
+
+// --- lines
+
+const STRING = String.raw`"[^"\\]*(?:\\.[^"\\]*)*"`
+const COUNT = String.raw`-?\d+`
+const FORMS = {
+  message: `{"topic":${STRING},"type":${STRING},"source":${STRING},"received_ns":${COUNT},"captured_ns":${COUNT},` +
+    '"clock":(true|false),"data":{.*}}',
+  type: `{"type":${STRING},"wire":${STRING},"format":${STRING},"definition":${STRING}}`,
+  lost: `{"lost":(${COUNT}),"topic":${STRING},"why":${STRING}}`,
+  trigger: `{"trigger":${STRING},"why":${STRING},"at_ns":${COUNT}}`,
+  stream: `{"stream":{"source":${STRING},"software":${STRING}}}`,
+}
+for (const kind in FORMS) FORMS[kind] = new RegExp(`^${FORMS[kind].replace(/[{}]/g, '\\$&')}$`, 's')
+const TOKEN = new RegExp(`${STRING}|[-+.\\w]+|[^]`, 'g')
+
+// Of which kind a line is, with what its form captures; an Error where it is not in its one form (docs/log.md, Records).
+function kindOf(line) {
+  const shown = line.toString('utf8')
+  const form = (holds) => {
+    if (!holds) throw new Error('not in the one form of a line')
+  }
+  form(line.length <= MAX.line && Buffer.from(shown).equals(line))
+  const open = [] // of each level, an object's names, or null for an array
+  const tokens = shown.match(TOKEN)
+  for (const [n, token] of tokens.entries()) {
+    if (token === '{' || token === '[') form(open.push(token === '{' ? new Set() : null) <= MAX.depth)
+    else if (token === '}' || token === ']') open.pop()
+    else if (token[0] === '"') {
+      const said = JSON.parse(token)
+      form(JSON.stringify(said) === token && !/\p{Cs}/u.test(said))
+      if (tokens[n + 1] === ':') form(open.at(-1) && !open.at(-1).has(said) && open.at(-1).add(said))
+    } else form(token.trim() && (!/[-\d]/.test(token[0]) || Number.isFinite(Number(token))))
+  }
+  const names = Object.keys(JSON.parse(shown)).join()
+  for (const kind in FORMS) {
+    const [match, captured] = FORMS[kind].exec(shown) ?? []
+    if (!match || (kind === 'message' && names !== 'topic,type,source,received_ns,captured_ns,clock,data')) continue
+    const counts = [...shown.matchAll(/"(?:received_ns|captured_ns|lost|at_ns)":(-?\d+)/g)]
+    form(counts.slice(0, kind === 'message' ? 2 : 1).every(([, count]) => BigInt(count) >= 0n && BigInt(count) < 2n ** 63n))
+    return { kind, captured, shown }
+  }
+  throw new Error('no line of these kinds')
 }
 
 // --- the reading
 
 const { values: options } = parseArgs({
-  options: Object.fromEntries(['node', 'contract', 'robot', 'ca', 'key', 'archive'].map((name) => [name, { type: 'string' }])),
+  options: Object.fromEntries(['node', 'contract', 'robot', 'ca', 'key'].map((name) => [name, { type: 'string' }])),
 })
 const wanted = ['node', 'contract', 'robot', 'ca'].filter((name) => !options[name])
 if (wanted.length) {
@@ -219,7 +360,7 @@ const end = Number(standing.chunks)
 
 const findings = []
 const told = (kind, chunk, detail = '', count = 1) => findings.push({ kind, chunk, count, detail })
-const NOTICES = new Set(['dropped', 'lost', 'triggered', 'restarted', 'no-grant', 'archived', 'clock'])
+const NOTICES = new Set(['dropped', 'lost', 'triggered', 'restarted', 'no-grant', 'clock'])
 const times = new Map()
 const timeOf = async (n) => {
   if (!times.has(n)) times.set(n, (await provider.getBlock(n)).timestamp)
@@ -241,14 +382,23 @@ for (let at = Number(standing.changedBlock); at > 0;) {
   registrations.unshift(...found)
   at = Number(found[0].args.previousBlock)
 }
-const newest = registrations.findLast((event) => event.eventName === 'Registered')
-if (newest && keccak256(newest.args.certificates) !== standing.certificatesHash) told('withheld', end, 'a registration')
+// The node cannot leave one out: they are linked, and the contract has the hash of the newest certificates.
+let linked = { block: 0, index: 0, hash: '0x' + ZEROS, revoked: false }
+let whole = true
+for (const { args, blockNumber, eventName } of registrations) {
+  whole &&= Number(args.previousBlock) === linked.block && Number(args.index) >= linked.index
+  const revoked = eventName === 'Revoked'
+  const hash = revoked ? linked.hash : keccak256(args.certificates)
+  linked = { block: blockNumber, index: Number(args.index), hash, revoked }
+}
+whole &&= linked.hash === standing.certificatesHash && linked.revoked === standing.revoked
+if (!whole || linked.block !== Number(standing.changedBlock)) told('withheld', end, 'a registration')
 const signers = []
 for (const event of registrations) {
   const one = { index: Number(event.args.index), block: event.blockNumber, revoked: event.eventName === 'Revoked' }
   if (!one.revoked) {
     const certificates = getBytes(event.args.certificates)
-    one.fingerprint = hex(digest(certificates.slice(0, element(certificates, 0).end)))
+    one.fingerprint = hex(digest(firstOf(certificates)))
     try {
       Object.assign(one, signer(certificates, roots, options.robot, await timeOf(event.blockNumber)))
     } catch (error) {
@@ -262,6 +412,7 @@ for (const event of registrations) {
 let head = null
 let records = 0
 const seen = new Map()
+const withoutBody = new Set() // of which only the dropped form was read
 
 function follow(header, at) {
   const stream = hex(header.stream)
@@ -285,39 +436,44 @@ async function prove(data, at, event) {
   const { header } = chunk
   const governing = signers.findLast((one) => one.index <= at)
   if (!governing?.key) throw new Wrong('untrusted', governing?.why ?? (governing ? 'revoked' : 'not registered'))
-  const purposes = !chunk.bare ? ['chunk'] : header.archived ? ['chunk', 'dropped'] : ['dropped']
-  const purpose = purposes.find((one) =>
-    holds(governing.key, join(text.encode(`rosbridge-eth/2 ${one}\0`), log, header.encoded), chunk.signature, false))
-  if (!purpose) throw new Wrong('forged')
+  const signed = join(text.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, header.encoded)
+  if (!holds(governing.key, signed, chunk.signature, false)) throw new Wrong('forged')
   if (header.sealed > governing.until) throw new Wrong('untrusted', "sealed after the certificate's end")
-  follow(header, at)
-  if (header.sealed > (await timeOf(event.blockNumber)) * 1000 + 300000) told('clock', at, 'sealed later than its block')
-  if (purpose === 'dropped') return told('dropped', at, '', header.records)
-  if (chunk.bare) {
-    if (!options.archive) return told('archived', at, '', header.records)
-    const file = `${options.archive}/${header.bodyDigest.slice(0, 2)}/${header.bodyDigest}`
-    if (existsSync(file)) chunk.body = new Uint8Array(readFileSync(file))
-    if (chunk.body.length !== header.bodyLength || hex(digest(chunk.body)) !== header.bodyDigest) throw new Wrong('withheld')
-  } else if (hex(digest(chunk.body)) !== header.bodyDigest) throw new Wrong('altered')
+  const time = await timeOf(event.blockNumber)
+  const altered = !chunk.bare && hex(digest(chunk.body)) !== header.bodyDigest
+  const restored = !chunk.bare && !altered && header.previous !== head?.digest && withoutBody.delete(header.digest)
+  if (!restored) {
+    follow(header, at)
+    if (chunk.bare) withoutBody.add(header.digest)
+    if (header.sealed > time * 1000 + 300000) told('clock', at, 'sealed later than its block')
+    if (header.sealed < governing.from) told('clock', at, "sealed before the robot's certificate began")
+  }
+  if (chunk.bare) return told('dropped', at, '', header.records)
+  if (altered) throw new Wrong('altered')
   if (!options.key) return header.records && told('no-grant', at, '', header.records)
+  let unsynchronised = 0
   for (const [n, line] of open(chunk, log, options.key).entries()) {
-    const shown = line.toString('utf8')
-    let value = null
+    let found
     try {
-      value = JSON.parse(shown)
-    } catch {}
-    if (typeof value !== 'object' || value === null) {
-      told('unopenable', at, `line ${n} is no JSON object`)
+      found = kindOf(line)
+    } catch (error) {
+      told('unopenable', at, `line ${n}: ${error.message}`)
       continue
     }
-    if (value.lost !== undefined) told('lost', at, '', value.lost)
-    if (value.trigger !== undefined) told('triggered', at)
-    if (value.topic === undefined || value.data === undefined) continue
-    const proof = { chunk: at, record: n, digest: header.digest, block: event.blockNumber, transaction: event.transactionHash }
+    if (found.kind === 'lost') told('lost', at, '', Number(found.captured))
+    if (found.kind === 'trigger') told('triggered', at)
+    if (found.kind !== 'message') continue
+    unsynchronised += found.captured === 'false'
+    const proof = {
+      chunk: at, record: n, stream: hex(header.stream), number: Number(header.number), digest: header.digest,
+      sealed: new Date(header.sealed).toISOString(), block: event.blockNumber,
+      block_time: new Date(time * 1000).toISOString(), transaction: event.transactionHash,
+    }
     // The line itself and not what was parsed of it: JavaScript's numbers would lose digits of the times.
-    process.stdout.write(`${printable(shown).slice(0, -1)},"proof":${JSON.stringify(proof)}}\n`)
+    process.stdout.write(`${printable(found.shown).slice(0, -1)},"proof":${JSON.stringify(proof)}}\n`)
     records += 1
   }
+  if (unsynchronised) told('clock', at, 'messages captured while it was not synchronised', unsynchronised)
 }
 
 let next = 0

@@ -13,7 +13,7 @@ import socket
 import sqlite3
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from datetime import datetime
 from pathlib import Path
@@ -71,7 +71,7 @@ def own_address(listen: Address) -> Address:
 
 
 def server_toml(
-    listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None, archive: str | None
+    listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None
 ) -> str:
     """The first server.toml of a home: what differs from the defaults, and where the rest is described."""
     lines = [
@@ -83,7 +83,6 @@ def server_toml(
         "",
         "[chain]",
         f'url = "{chain_url}"',
-        *(["", "[archive]", f'url = "{archive}"'] if archive else []),
     ]
     return "\n".join(lines) + "\n"
 
@@ -92,13 +91,12 @@ def init_home(
     home: OperatorHome, passphrase: bytes, *, reader: ReaderHome, reader_passphrase: bytes, now: datetime,
     listen: str = "0.0.0.0:7410", public: str | None = None, chain_url: str = "http://127.0.0.1:8545",
     server: str = "server", ca: Path | None = None, ca_passphrase: bytes | None = None, keys: Keyring | None = None,
-    passphrase_file: Path | None = None, archive: str | None = None,
+    passphrase_file: Path | None = None,
 ) -> Keyring:
     """Make an operator's home: CA, server's identity, seed of the accounts; and the reader `owner` in its own folder.
 
     ca: the folder of the CA, which is made there unless it holds one (`ca.key.pem`, `ca.crt.pem`); without it, in the
     home. ca_passphrase: where it differs. keys: instead of a new seed. passphrase_file: is named in server.toml.
-    archive: a folder, which is made, or the URL of a bucket.
     """
     require_empty(home.path)
     require_empty(reader.path)
@@ -106,11 +104,10 @@ def init_home(
         door = parse_address(listen)
         text = server_toml(
             door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file,
-            str(Path(archive).absolute()) if archive and "://" not in archive else archive,
         )
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
-    named = parse_config(ServerConfig, text, home.config).archive
+    parse_config(ServerConfig, text, home.config)
     if home.path.resolve() == reader.path.resolve():
         raise ConfigError(f"{home.path} cannot be the reader's home as well; choose another folder for one of them")
     with new_home(home.path), new_home(reader.path):
@@ -128,8 +125,6 @@ def init_home(
         write_atomically(home.config, text.encode())
         elsewhere = {} if ca is None else {"ca": str(ca.absolute())}
         make_home(home.path, HomeKind.OPERATOR, **elsewhere, reader=str(reader.path.absolute()))
-    if named is not None and isinstance(named.url, Path):
-        named.url.mkdir(parents=True, exist_ok=True)
     return keys
 
 
@@ -254,7 +249,7 @@ def deploy_contract(
     write_atomically(home.reader_config, _reader_toml(made, node).encode())
     owner = Path(home_of(home.path)["reader"])
     if (owner / "home.json").exists():  # it may have been carried away
-        _give_reader_toml(home, ReaderHome(owner))
+        write_atomically(ReaderHome(owner).config, home.reader_config.read_bytes())
     return made
 
 
@@ -269,15 +264,6 @@ def _reader_toml(ledger: Deployment, node: str) -> str:
 
 
 # Readers
-
-
-def _give_reader_toml(home: OperatorHome, reader: ReaderHome) -> None:
-    """What all readers are told, and where the archive is as server.toml has it now; its keys are not theirs."""
-    archive, text = load_server_config(home.config).archive, home.reader_config.read_text(encoding="utf-8")
-    if archive is not None:
-        told = {"url": archive.url, "endpoint": archive.endpoint, "region": archive.region}
-        text += "\n[archive]\n" + "".join(f'{key} = "{value}"\n' for key, value in told.items() if value)
-    write_atomically(reader.config, text.encode())
 
 
 def add_reader(
@@ -305,7 +291,7 @@ def _make_reader(
     ids.save_identity(reader.path, identity, [ca.certificate], passphrase)
     write_atomically(reader.public, identity.public.pem)
     if home.reader_config.exists():
-        _give_reader_toml(home, reader)
+        write_atomically(reader.config, home.reader_config.read_bytes())
     registry.enrol(identity.public, now, replace=replace)
     write_atomically(home.readers / f"{name}.pem", identity.public.pem)
     make_home(reader.path, HomeKind.READER, name=name)
@@ -318,7 +304,7 @@ class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
     unfunded: why its account was given no ETH, if it was not; the server gives it some later. buried: chunks of the one
-    that bore the name before which became dead letters.
+    that bore the name before which became dead letters. readers: for whom the robot seals.
     """
 
     account: str
@@ -326,6 +312,7 @@ class Registered(NamedTuple):
     bundle: Path
     unfunded: str | None
     buried: int
+    readers: Sequence[str]
 
 
 def register_robot(
@@ -382,10 +369,13 @@ def register_robot(
                 buried = _bury(inbox, ledger, tk, f"{name} was replaced")
         number, account, block = _register(registry, ledger, keys, tk, peer.certificates, standing)
         registry.enrol(peer, now, number=number, account=account, replace=replace)
-        readers = {reader.name: reader.certificates.decode() for reader in registry.readers()}
+        readers = {
+            reader.name: reader.certificates.decode() for reader in registry.readers()
+            if now <= ids.public_identity(reader.certificates).not_after
+        }  # fmt: skip
     text = {file: content.decode() for file, content in files.items()}
     private = {file: text.pop(file) for file in ids.KEY_FILES if file in text}
-    made = Bundle(end, text, readers, private)
+    made = Bundle(end, text, readers, private).signed(ca.key)
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
     unfunded = None
@@ -396,7 +386,7 @@ def register_robot(
         unfunded = "the operator's account has none for it"
     except ChainError as error:
         unfunded = str(error)
-    return Registered(account, block, path, unfunded, buried)
+    return Registered(account, block, path, unfunded, buried, sorted(readers))
 
 
 def _register(

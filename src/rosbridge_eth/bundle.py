@@ -1,19 +1,23 @@
 """How a robot joins: its request, the bundle that answers it, and the home that it makes of them.
 
     {"format": "rosbridge-eth request 2", "name": …, "signing": PEM, "encryption": PEM}
-    {"format": "rosbridge-eth bundle 2", "name": …, "server_name": …, …}
+    {"format": "rosbridge-eth bundle 3", "name": …, "end": …, "certificates": …, "readers": …, "signature": …}
 
 A request holds two certificate requests (PKCS#10), signed by the keys that they name and that never leave the robot.
-A bundle that answers one holds nothing secret. Where the operator made the keys (easy_register of the paper), they
-are in it, encrypted under the registration password, and the whole is a sealed box (files) under that password.
+A bundle that answers one holds nothing secret. The CA whose certificate is in it signs it, so that nobody else changes
+anything of it unseen; the fingerprint of that certificate is compared with the operator's. Where the operator made the
+keys (easy_register of the paper), they are in it, encrypted under the registration password, and the whole is a sealed
+box (files) under that password.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from typing import NamedTuple
 
 from pydantic import TypeAdapter
 
@@ -23,7 +27,7 @@ from rosbridge_eth.errors import BridgeError, ConfigError, IdentityError
 from rosbridge_eth.files import box_head, open_box, seal_box, write_atomically
 from rosbridge_eth.home import BridgeEnd, HomeKind, RobotHome, home_of, make_home, new_home, require_empty
 from rosbridge_eth.identity import CERTIFICATE_FILES, KEY_FILES, check_name
-from smcrypto import SMCryptoError, sm2, x509
+from smcrypto import InvalidSignature, SMCryptoError, sm2, x509
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +35,7 @@ FIRST_CONFIG = """\
 # What this robot sends to the chain; docs/configuration.md describes every key.
 topics = ["/robot_1/odom"]
 """
-BUNDLE, REQUEST = "rosbridge-eth bundle 2", "rosbridge-eth request 2"
+BUNDLE, REQUEST = "rosbridge-eth bundle 3", "rosbridge-eth request 2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +71,31 @@ class Bundle:
     """What a robot needs besides its topics.
 
     certificates: sign.crt.pem, enc.crt.pem and ca.crt.pem. keys: sign.key.pem and enc.key.pem where the operator
-    made them, otherwise nothing. readers: name to two certificates in PEM.
+    made them, otherwise nothing. readers: name to two certificates in PEM. signature: r | s in hex, of the CA for the
+    purpose "bundle", over all but keys and signature as JSON, members in order of their names, without spaces.
     """
 
     end: BridgeEnd
     certificates: dict[str, str]
     readers: dict[str, str]
     keys: dict[str, str] = field(default_factory=dict, repr=False)
+    signature: str = ""
+
+    def _signed(self) -> bytes:
+        parts = {"end": asdict(self.end), "certificates": self.certificates, "readers": self.readers}
+        return json.dumps(parts, sort_keys=True, separators=(",", ":")).encode()
+
+    def signed(self, ca: sm2.PrivateKey) -> Bundle:
+        return replace(self, signature=ids.sign(ca, "bundle", self._signed()).hex())
+
+    def verify(self, ca: sm2.PublicKey) -> None:
+        """Return if the CA signed this; else IdentityError."""
+        try:
+            ids.verify(ca, "bundle", self._signed(), bytes.fromhex(self.signature))
+        except (ValueError, InvalidSignature):
+            raise IdentityError(
+                "this bundle is not what the CA signed: it was altered on its way; have the operator give it again"
+            ) from None
 
     def encode(self, password: bytes | None = None) -> bytes:
         """The bundle as a file's bytes; with keys it needs a password, without it takes none."""
@@ -95,14 +117,17 @@ def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
         if "sealed" in content:
             content = json.loads(open_box(data, password or b"", BUNDLE)[1])
         bundle = TypeAdapter(Bundle).validate_python(content)
-        for name in (bundle.end.robot, *bundle.readers):  # they become names of files, as the next two do
+        for name in (bundle.end.robot, bundle.end.server_name, *bundle.readers):  # most become names of files
             check_name(name)
         if bundle.certificates.keys() != set(CERTIFICATE_FILES) or bundle.keys.keys() not in (set(), set(KEY_FILES)):
             raise ValueError
-        if not (bundle.end.ledger and parse_address(bundle.end.server_address)):  # each raises where it is none
+        address = parse_address(bundle.end.server_address)
+        if not bundle.end.ledger or len(bundle.end.genesis + bundle.end.contract) != 66 + 42:
             raise ValueError
     except (ValueError, OverflowError):
         raise IdentityError("this bundle file was damaged") from None
+    if address.nowhere:
+        raise IdentityError(f"this bundle tells its robot to send to {address}, which is no machine's address")
     return bundle
 
 
@@ -122,12 +147,23 @@ def ask_to_join(home: RobotHome, name: str, password: bytes, config: str = FIRST
     return request
 
 
-def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
+class Joined(NamedTuple):
+    """With what a robot joined. readers: for whom it seals.
+
+    ca: fingerprint of its certificate (SM3, hex), to be compared with the operator's: who could exchange the bundle on
+    its way could have made it with a CA of his own.
+    """
+
+    ca: str
+    readers: Sequence[str]
+
+
+def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> Joined:
     """Complete a robot's home with the bundle that answers its request, or make it of a bundle that holds keys.
 
-    The CA's fingerprint (SM3 of its certificate, hex), which is to be compared with the operator's: who could change
-    the bundle on its way could have put another there. A home may join again where its keys were certified anew; its
-    readers are then those of the bundle alone.
+    A home may join again where its keys were certified anew; its readers are then those of the bundle alone. A bundle
+    that was made before the one that the home has is refused: its readers may have been revoked since. A reader whose
+    certificates end later is left out where the robot seals (robot.reader_keys), by its clock.
     """
     files = {name: content.encode() for name, content in {**bundle.certificates, **bundle.keys}.items()}
     peer = ids.public_identity(b"".join(files.get(name, b"") for name in ("sign.crt.pem", "enc.crt.pem")))
@@ -137,11 +173,18 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
     else:
         _require_answer(home, peer)
     roots = ids.read_certificates(files.get("ca.crt.pem", b""))
+    bundle.verify(roots[0].public_key)
+    trust = ids.Trust(roots)
     # At a time when they hold: a robot's clock may begin in 1970.
-    ids.Trust(roots).check(
-        peer.signing_certificate.to_der(), peer.encryption_certificate.to_der(), role=ids.Role.ROBOT,
-        name=bundle.end.robot, at=peer.not_before,
-    )  # fmt: skip
+    trust.check(*peer.pair, role=ids.Role.ROBOT, name=bundle.end.robot, at=peer.not_before)
+    for name, pem in bundle.readers.items():
+        reader = ids.public_identity(pem.encode())
+        trust.check(*reader.pair, role=ids.Role.READER, name=name, at=max(peer.not_before, reader.not_before))
+    before = None
+    with suppress(OSError, BridgeError):  # absent, or damaged, which joining again mends
+        before = ids.public_identity(b"".join((home.identity / name).read_bytes() for name in CERTIFICATE_FILES[:2]))
+    if before is not None and peer.not_before < before.not_before:
+        raise IdentityError("this bundle is older than the one that this robot joined with; have it registered again")
     known = None
     with suppress(ConfigError):  # absent, or damaged, which joining again mends
         known = home.bridge().ledger
@@ -161,16 +204,18 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> str:
         home.raise_clock_floor(peer.not_before.timestamp())
         home.save_bridge(bundle.end)
         make_home(home.path, HomeKind.ROBOT, name=bundle.end.robot)
-    return roots[0].fingerprint().hex()
+    return Joined(roots[0].fingerprint().hex(), sorted(bundle.readers))
 
 
-def take_up(home: RobotHome) -> str | None:
-    """Join with the bundle that was put into the home (RobotHome.answer), which then goes; the CA's fingerprint, or
-    None where there is none. A robot that has joined goes on as it is where that fails."""
+def take_up(home: RobotHome) -> Joined | None:
+    """Join with the bundle that was put into the home (RobotHome.answer), which then goes; None where there is none.
+
+    A robot that has joined goes on as it is where that fails.
+    """
     if not home.answer.exists():
         return None
     try:
-        fingerprint = join(home, read_bundle(home.answer.read_bytes()))
+        joined = join(home, read_bundle(home.answer.read_bytes()))
     except (BridgeError, OSError) as error:
         said = f"{home.answer} is not taken up: {error}"
         if not home.bridge_file.exists():
@@ -178,7 +223,7 @@ def take_up(home: RobotHome) -> str | None:
         log.error("%s", said)
         return None
     home.answer.unlink()
-    return fingerprint
+    return joined
 
 
 def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:

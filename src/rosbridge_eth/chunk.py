@@ -9,8 +9,7 @@
 
 Numbers are big-endian, hashes SM3, signatures SM2. The signature is over ledger | Tk | header for the
 purpose "chunk", or "dropped" where the robot itself removed the body; see identity. The root is the Merkle
-tree of RFC 9162, 2.1, over salted lines. An archived chunk may be larger; its body rests in an archive under
-its digest, and header | signature go on the chain. docs/log.md says all of it byte by byte.
+tree of RFC 9162, 2.1, over salted lines. docs/log.md says all of it byte by byte.
 
 Not here: what a line says (capture), when a chunk is closed (writer), which certificate governs (reading).
 """
@@ -22,7 +21,7 @@ import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from eth_hash.auto import keccak
@@ -37,20 +36,16 @@ else:
     from compression import zstd
 
 VERSION: Final = 2
-#: Flags: the last chunk of an orderly run; the body is in the archive and not on the chain.
+#: The only flag: the last chunk of an orderly run.
 GOODBYE: Final = 1
-ARCHIVED: Final = 2
 
 MAX_BODY: Final = 64 * 1024 - 48  # the longest below 64 KiB: 1,023 blocks of 64 and the tag
-MAX_ARCHIVED_BODY: Final = 16 * 1024 * 1024 - 48
 MAX_READERS: Final = 16
 MAX_RECORDS: Final = 1000
 #: Bytes of JSON Lines that a reader unpacks at most.
 MAX_PLAINTEXT: Final = 4 * 1024 * 1024
-MAX_ARCHIVED_PLAINTEXT: Final = 16 * 1024 * 1024
 #: Bytes of a line that fits a chunk of its own whatever it holds.
 MAX_LINE: Final = 60 * 1024
-MAX_ARCHIVED_LINE: Final = MAX_ARCHIVED_PLAINTEXT - 128 * 1024  # zstd makes 1/256 more of what it cannot compress
 #: The year 10000; a chunk is sealed before.
 MAX_TIME_MS: Final = 253_402_300_800_000
 
@@ -62,12 +57,9 @@ _GRANT = _TAG + _WRAPPED
 _FIXED = struct.Struct(">BB16sQ32sQI32sI32sB")
 MAX_HEADER: Final = _FIXED.size + MAX_READERS * _GRANT
 MAX_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_BODY
-MAX_ARCHIVED_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_ARCHIVED_BODY
 
 #: zstd's level, chosen by benchmarks/bench_log.py.
 LEVEL: Final = 9
-#: Of archived chunks: it undoes what base64 adds, at ten times the speed of level 9 (benchmarks/video.py).
-ARCHIVED_LEVEL: Final = 1
 _MAGIC = b"\x28\xb5\x2f\xfd"
 _MAX_BLOCK = 128 * 1024  # RFC 8878, 3.1.1.2.4
 
@@ -143,16 +135,6 @@ class Header:
         """Whether the robot said that nothing follows in this stream."""
         return bool(self.flags & GOODBYE)
 
-    @property
-    def archived(self) -> bool:
-        """Whether the body's place is the archive."""
-        return bool(self.flags & ARCHIVED)
-
-    @property
-    def max_line(self) -> int:
-        """Bytes of a line of it, at most."""
-        return MAX_ARCHIVED_LINE if self.archived else MAX_LINE
-
     def __str__(self) -> str:
         return f"chunk {self.number} of stream {self.stream.hex()[:8]}"
 
@@ -162,7 +144,7 @@ class Header:
         if not _FIXED.size <= len(data) <= MAX_HEADER:
             raise Malformed(f"no header of a chunk has {len(data)} bytes")
         version, flags, stream, number, previous, sealed, records, root, size, digest, count = _FIXED.unpack_from(data)
-        if version != VERSION or flags & ~(GOODBYE | ARCHIVED):
+        if version != VERSION or flags & ~GOODBYE:
             raise Malformed(f"a chunk of version {version} with flags {flags} is not known here")
         if len(data) != _FIXED.size + count * _GRANT:
             raise Malformed(f"a header with {count} grants does not have {len(data)} bytes")
@@ -174,11 +156,11 @@ class Header:
         if sealed >= MAX_TIME_MS:
             raise Malformed(f"{header} was sealed after the year 9999")
         if records == 0:
-            if size or grants or root != _EMPTY or digest != _EMPTY or header.archived:
-                raise Malformed(f"{header} has no records, and a body, root, grants or an archive nevertheless")
+            if size or grants or root != _EMPTY or digest != _EMPTY:
+                raise Malformed(f"{header} has no records, and a body, root or grants nevertheless")
         elif (
             records > MAX_RECORDS or not 1 <= count <= MAX_READERS or size % _BLOCK != _GCM_TAG
-            or not _GCM_TAG < size <= (MAX_ARCHIVED_BODY if header.archived else MAX_BODY)
+            or not _GCM_TAG < size <= MAX_BODY
         ):  # fmt: skip
             raise Malformed(f"{header} cannot have {records} records in {size} bytes for {count} readers")
         return header
@@ -203,13 +185,8 @@ class Chunk:
 
     @property
     def bare(self) -> bool:
-        """Whether the body is not here: the robot dropped it, or it is in the archive; `signed_as` tells which."""
+        """Whether the body is not here: the robot dropped it, and signed that it did."""
         return self.header.body_length > 0 and not self.body
-
-    @property
-    def on_chain(self) -> Chunk:
-        """The form that the chain has: an archived chunk without its body."""
-        return replace(self, body=b"") if self.header.archived else self
 
     @staticmethod
     def parse(data: bytes | bytearray | memoryview) -> Chunk:
@@ -217,24 +194,13 @@ class Chunk:
 
         Nothing is verified: see `verify`.
         """
-        if not _FIXED.size <= len(data) <= MAX_ARCHIVED_CHUNK:
-            raise Malformed(f"no chunk has {len(data)} bytes")
-        bare = Chunk.parse_front(data)
-        body = memoryview(data)[len(bare.encoded) :]
-        if len(body) not in (0, bare.header.body_length):
-            raise Malformed(f"{bare.header} does not have {len(data)} bytes")
-        return replace(bare, body=bytes(body))
-
-    @staticmethod
-    def parse_front(data: bytes | bytearray | memoryview) -> Chunk:
-        """The chunk whose encoding begins like this, without its body. Malformed."""
-        if len(data) < _FIXED.size:
+        if not _FIXED.size <= len(data) <= MAX_CHUNK:
             raise Malformed(f"no chunk has {len(data)} bytes")
         end = _FIXED.size + data[_FIXED.size - 1] * _GRANT
-        header, signature = Header.parse(bytes(data[:end])), bytes(data[end : end + identity.SIGNATURE_SIZE])
-        if len(signature) != identity.SIGNATURE_SIZE:
+        header, body_at = Header.parse(bytes(data[:end])), end + identity.SIGNATURE_SIZE
+        if len(data) not in (body_at, body_at + header.body_length):
             raise Malformed(f"{header} does not have {len(data)} bytes")
-        return Chunk(header, signature, b"")
+        return Chunk(header, bytes(data[end:body_at]), bytes(data[body_at:]))
 
 
 # Building
@@ -243,20 +209,20 @@ class Chunk:
 def seal(
     log: Log, key: sm2.PrivateKey, lines: Sequence[bytes], *,
     stream: bytes, number: int, previous: bytes, sealed_ms: int, readers: Sequence[sm2.PublicKey],
-    goodbye: bool = False, archived: bool = False, compress: bool = True, level: int | None = None,
+    goodbye: bool = False, compress: bool = True, level: int = LEVEL,
     randomness: Randomness = secrets.token_bytes,
 ) -> Chunk:
     """The chunk that holds `lines`, signed with the robot's `key` and encrypted to `readers` (1 to 16).
 
     lines: not empty and without newline, each; none at all make a chunk without body. previous: the digest of
     the header before. compress=False stores the lines as they are, so that sizes tell nothing of the content.
-    archived: its body's place is the archive; it has lines. TooLarge if the lines do not fit; then nothing was used up.
+    TooLarge if the lines do not fit; then nothing was used up.
     """
     root, body, grants = _EMPTY, b"", b""
     if lines:
         if not 1 <= len(readers) <= MAX_READERS:
             raise ValueError(f"a chunk is for 1 to {MAX_READERS} readers, not {len(readers)}")
-        plaintext = _pack(lines, compress, level or (ARCHIVED_LEVEL if archived else LEVEL), archived)
+        plaintext = _pack(lines, compress, level)
         place = stream + number.to_bytes(8, "big")
         secret = sm3.hmac(key.to_bytes(), b"rosbridge-eth/2 content key")
         fresh = randomness(32) + log.ledger + log.tk + place + sm3.digest(plaintext)
@@ -265,7 +231,7 @@ def seal(
         root = _levels(_leaves(lines, new_key))[-1][0]
         grants = b"".join(_tag(place, reader) + reader.encrypt(new_key, encoding="c1c3c2") for reader in readers)
     fixed = _FIXED.pack(
-        VERSION, GOODBYE * goodbye | ARCHIVED * archived, stream, number, previous, sealed_ms,
+        VERSION, GOODBYE * goodbye, stream, number, previous, sealed_ms,
         len(lines), root, len(body), sm3.digest(body), len(grants) // _GRANT,
     )  # fmt: skip
     header = Header.parse(fixed + grants)
@@ -279,17 +245,16 @@ def drop(log: Log, key: sm2.PrivateKey, chunk: Chunk) -> Chunk:
     return Chunk(chunk.header, identity.sign(key, "dropped", _signed(log, chunk.header)), b"")
 
 
-def _pack(lines: Sequence[bytes], compress: bool, level: int, archived: bool) -> bytes:
+def _pack(lines: Sequence[bytes], compress: bool, level: int) -> bytes:
     """The plaintext: the lines in one frame, padded."""
     if any(not line or b"\n" in line for line in lines):
         raise ValueError("a line is not empty and holds no newline")
-    most = (MAX_ARCHIVED_BODY if archived else MAX_BODY) - _GCM_TAG
     size = sum(map(len, lines)) + len(lines)
-    if len(lines) > MAX_RECORDS or size > (MAX_ARCHIVED_PLAINTEXT if archived else MAX_PLAINTEXT):
+    if len(lines) > MAX_RECORDS or size > MAX_PLAINTEXT:
         raise TooLarge(f"{len(lines)} lines of {size} bytes are too many for a chunk")
     content = b"\n".join([*lines, b""])
     frame = _compressed(content, level) if compress else _stored(content)
-    if len(frame) > most:
+    if len(frame) > MAX_BODY - _GCM_TAG:
         raise TooLarge(f"{len(lines)} lines take {len(frame)} bytes, more than fit a chunk")
     return frame.ljust(len(frame) + -len(frame) % _BLOCK, b"\0")
 
@@ -330,21 +295,16 @@ def verify(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> None:
     header = chunk.header
     if not chunk.bare and (len(chunk.body) != header.body_length or sm3.digest(chunk.body) != header.body_digest):
         raise Altered(f"the body of {header} is not the one that its header names")
-    if signed_as(log, public_key, chunk) == "chunk" and chunk.bare:
-        raise Altered(f"the body of {header}, which is for the archive, is not with it")
+    verify_signature(log, public_key, chunk)
 
 
-def signed_as(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> str:
-    """The purpose for which the holder of `public_key` signed the chunk in this form; Forged if for none.
-
-    "dropped" where the robot removed the body, else "chunk". The body is not looked at.
-    """
-    may_be = ["chunk", "dropped"] if chunk.bare and chunk.header.archived else ["dropped" if chunk.bare else "chunk"]
-    for purpose in may_be:
-        with suppress(InvalidSignature):
-            identity.verify(public_key, purpose, _signed(log, chunk.header), chunk.signature)
-            return purpose
-    raise Forged(f"the signature of {chunk.header} does not hold")
+def verify_signature(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> None:
+    """As `verify`, but the body is not looked at: whether the robot wrote this header, for this form. Forged."""
+    try:
+        purpose = "dropped" if chunk.bare else "chunk"
+        identity.verify(public_key, purpose, _signed(log, chunk.header), chunk.signature)
+    except InvalidSignature:
+        raise Forged(f"the signature of {chunk.header} does not hold") from None
 
 
 def content_key(header: Header, reader: sm2.PrivateKey) -> bytes:
@@ -384,15 +344,14 @@ def _unpack(header: Header, plaintext: bytes) -> tuple[bytes, ...]:
     """The lines of a plaintext; memory and time are bounded whatever it holds."""
     if not plaintext.startswith(_MAGIC):  # libzstd would take skippable frames and old formats as well
         raise Unopenable(f"{header} holds no zstd frame")
-    most = MAX_ARCHIVED_PLAINTEXT if header.archived else MAX_PLAINTEXT
-    window = {int(zstd.DecompressionParameter.window_log_max): most.bit_length() - 1}
+    window = {int(zstd.DecompressionParameter.window_log_max): MAX_PLAINTEXT.bit_length() - 1}
     unpacking = zstd.ZstdDecompressor(options=window)
     try:
-        content = unpacking.decompress(plaintext, most + 1)
+        content = unpacking.decompress(plaintext, MAX_PLAINTEXT + 1)
     except zstd.ZstdError as error:
         raise Unopenable(f"{header} cannot be unpacked: {error}") from None
-    if not unpacking.eof or len(content) > most:
-        raise Unopenable(f"{header} unpacks to more than {most} bytes, or its frame has no end")
+    if not unpacking.eof or len(content) > MAX_PLAINTEXT:
+        raise Unopenable(f"{header} unpacks to more than {MAX_PLAINTEXT} bytes, or its frame has no end")
     padding = unpacking.unused_data
     if len(padding) >= _BLOCK or any(padding):
         raise Unopenable(f"{header} holds more than one frame and its padding")

@@ -6,7 +6,6 @@ processes are threads. What comes back is compared with the bag's messages, fiel
 
 from __future__ import annotations
 
-import io
 import secrets
 import tempfile
 import threading
@@ -16,12 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
-from rich.console import Console
-from rich.text import Text
+from rich.table import Table
 
 from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
@@ -48,10 +47,17 @@ FUNDS = 1000 * 10**18
 SETTLE = 60.0  # seconds for the last chunk to be confirmed
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>From a topic to the chain and back</title>
 <meta name="viewport" content="width=device-width">
-<style>body {{ margin: 2rem }} pre {{ overflow-x: auto }} img {{ max-width: 100% }} {stylesheet}</style>
+<style>
+body {{ margin: 2rem auto; max-width: 70rem; padding: 0 1rem; font: 1rem/1.5 system-ui, sans-serif; color: #222 }}
+div {{ overflow-x: auto }} img {{ max-width: min(100%, 40rem) }} h2 {{ font-size: 1.1rem; margin: 2rem 0 .5rem }}
+table {{ border-collapse: collapse }} th, td {{ padding: .25rem 1rem .25rem 0; text-align: left }}
+th {{ border-bottom: 1px solid #999; font-weight: 600 }}
+.number {{ text-align: right; font-variant-numeric: tabular-nums }}
+.verdict {{ border-left: .3rem solid {colour}; padding: .5rem 1rem; background: #f4f4f4 }}
+</style>
 <h1>From a topic to the chain and back</h1>
+<p class="verdict">{verdict}</p>
 <p>The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
-<pre>{code}</pre>
 """
 PICTURE = '<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain">'
 
@@ -223,6 +229,15 @@ def run_demo(
     )
 
 
+def _html(table: Table) -> str:
+    """A table of the terminal as one of a page."""
+    kinds = [' class="number"' if column.justify == "right" else "" for column in table.columns]
+    rows = zip(*([escape(str(cell)) for cell in column.cells] for column in table.columns), strict=True)
+    head = "".join(f"<th{kind}>{escape(str(each.header))}" for kind, each in zip(kinds, table.columns, strict=True))
+    body = "".join("<tr>" + "".join(f"<td{kind}>{cell}" for kind, cell in zip(kinds, row, strict=True)) for row in rows)
+    return f"<h2>{escape(str(table.title))}</h2><div><table><tr>{head}{body}</table></div>\n"
+
+
 # The command
 
 
@@ -288,14 +303,14 @@ def demo(
     ]
     said = [*result.verdict.lines(), *result.comparison.differences]
     tables = [
-        table("Records", ["stage", "records"], counts, right=[1]),
+        table("Records", ["what", "number"], counts, right=[1]),
         table("Time", ["step", "time"], times, right=[1]),
         table(f"Transactions to {result.contract}", heads, batches, right=[0, 1, 2, 3, 4]),
     ]
     passed = "Every record came back, proven and equal to the bag's." if result.passed else "Not all came back."
-    page = Console(record=True, file=io.StringIO(), width=140, highlight=False, emoji=False)
-    page.print(*map(Text, (f"{passed} The bag is {chosen.name}.", *said)), *tables, sep="\n")
-    page.save_html(str(report / "report.html"), code_format=PAGE + picture)
+    lines = "<br>".join(escape(line) for line in (f"{passed} The bag is {chosen.name}.", *said))
+    page = PAGE.format(colour="#2a7" if result.passed else "#c33", verdict=lines) + picture
+    (report / "report.html").write_text(page + "".join(map(_html, tables)), encoding="utf-8")
     data.print(*tables)
     for line in said:
         talk(line)

@@ -1,4 +1,4 @@
-"""`doctor`: tries everything that a home depends on, for real, and names the mend for what does not work.
+"""`doctor`: tries everything that a home depends on, for real, and names the fix for what does not work.
 
 A check is one function that yields findings. It changes nothing: what is not there yet is not made, and a port or a
 session that is tried is given back.
@@ -25,7 +25,6 @@ import typer
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth import sources
-from rosbridge_eth.archive import open_archive
 from rosbridge_eth.bundle import needs_password, read_bundle
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
@@ -52,11 +51,10 @@ EXPIRY = timedelta(days=30)
 LITTLE_ROOM = 64 << 20  # bytes
 WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
 OLD_HEAD = 12 * 3600.0  # seconds since the last block
-ANYWHERE = ("0.0.0.0", "::")  # noqa: S104 - what is looked for
 
 
 class Finding(NamedTuple):
-    """One thing that was tried: what was found, and the mend where something is to be done.
+    """One thing that was tried: what was found, and the fix where something is to be done.
 
     result: "ok"; "note": it works, and will not for ever or not at its best; "broken"; "skipped": it could not be
     tried, and `mend` says what it takes.
@@ -76,7 +74,7 @@ ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note
 
 
 def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Findings:
-    """Run the checks one after the other; a failure of the bridge's own is a finding, whose text has the mend. What
+    """Run the checks one after the other; a failure of the bridge's own is a finding, whose text has the fix. What
     ends several checks is told once."""
     told = set[str]()
     for what, check in checks.items():
@@ -222,15 +220,13 @@ def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings
         content = bundle.read_bytes()
         try:
             told = robots if needs_password(content) else read_bundle(content).end.server_address
-        except IdentityError:
-            yield note("bundle", f"{bundle} was damaged",
+        except IdentityError as error:
+            yield note("bundle", f"{bundle}: {error}",
                        f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
             continue
         if told != robots:
-            nowhere = parse_address(told).host in ANYWHERE
-            found = f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}"
-            mended = f'write server = "{robots}" into the robot.toml of who joined with it'
-            yield (broken if nowhere else note)("bundle", found, mended)
+            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
+                       f'write server = "{robots}" into the robot.toml of who joined with it')
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -290,24 +286,6 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
         yield ok("store", f"{sum(waiting.chunks for waiting in inbox.totals().values())} chunks wait")
 
 
-def archive(home: OperatorHome, secret: bytes | None) -> Findings:
-    """The operator's archive keeps an object and gives it back."""
-    config = load_server_config(home.config).archive
-    if config is None:
-        return
-    opened = open_archive(config)
-    opened.check()
-    yield ok("archive", f"{opened} was written and read; one small object stays in it")
-
-
-def readers_archive(home: ReaderHome, secret: bytes | None) -> Findings:
-    config = load_reader_config(home.config).archive
-    if config is not None:
-        opened = open_archive(config)
-        opened.get(bytes(32), 0)
-        yield ok("archive", f"{opened} answers")
-
-
 def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.ledger.contract import WEI_PER_ETH
@@ -338,7 +316,7 @@ def bridge(home: RobotHome, secret: bytes | None) -> Findings:
     end, config = home.bridge(), load_robot_config(home.config)
     yield ok("configuration", str(home.config))
     place = config.server or parse_address(end.server_address)
-    if place.host in ANYWHERE or place.port == 0:
+    if place.nowhere:
         yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
                      'write server = "HOST:PORT", as the server is reached, into robot.toml')
     else:
@@ -431,13 +409,13 @@ CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
         "server's certificates": lambda home, _: certificates(
             home.server, f"run `renew --home {home.path}`, then start the server again"),
         "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
-        "archive": archive, "node": operator_node,
+        "node": operator_node,
     }),
     HomeKind.ROBOT: (RobotHome, _MACHINE | {
         "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
         "server": session,
     }),
-    HomeKind.READER: (ReaderHome, _MACHINE | {"keys": own_keys, "node": reader_nodes, "archive": readers_archive}),
+    HomeKind.READER: (ReaderHome, _MACHINE | {"keys": own_keys, "node": reader_nodes}),
 }  # fmt: skip
 
 
@@ -456,7 +434,7 @@ def doctor(
         "--passphrase-file", help="Of this home's keys (a robot's password), to try them.")] = None,
     json: Json = False,
 ) -> None:
-    """Try all that a home depends on, and name the mend. An operator's, a robot's, a reader's.
+    """Check all that a home depends on, and name the fix. An operator's, a robot's, a reader's.
 
     Exits with 1 if something is broken.
     """
@@ -479,4 +457,4 @@ def doctor(
         rows = [(f.what, _SIGN[f.result], f.found) for f in findings]
         data.print(table(f"The {kind}'s home {home}", ["what", "result", "found"], rows))
     if count:
-        raise BridgeError(f"broken: {count}; each line above names the mend")
+        raise BridgeError(f"broken: {count}; each line above names the fix")

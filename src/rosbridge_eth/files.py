@@ -76,6 +76,9 @@ def seal_box(secret: bytes, password: bytes, head: Mapping[str, Any], *, n: int 
     return json.dumps({**shown, "sealed": base64.b64encode(sealed).decode()}, indent=1).encode() + b"\n"
 
 
+_MAX_BRACKETS = 100  # of nesting json.loads makes recursion, which py-evm allows up to where the stack ends
+
+
 def box_head(data: bytes, expected: str) -> dict[str, Any]:
     """What a JSON file of ours says in the clear, if its "format" is `expected`; else IdentityError.
 
@@ -83,6 +86,8 @@ def box_head(data: bytes, expected: str) -> dict[str, Any]:
     """
     thing = expected.split()[1]
     try:
+        if data.count(b"[") + data.count(b"{") > _MAX_BRACKETS:
+            raise ValueError
         head = json.loads(data)
         given = head["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:

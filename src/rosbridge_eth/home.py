@@ -133,7 +133,7 @@ def make_home(path: Path, kind: HomeKind, **more: str) -> None:
 
 
 def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[str, Any]:
-    """What `make_home` wrote. ConfigError where it is nobody's home, of the first edition, or not of this kind."""
+    """What `make_home` wrote. ConfigError where it is no home, of the first edition, or not of this kind."""
     if not any((path / name).exists() for name in ("home.json", _UNFINISHED)) and any(
         (path / name).exists() for name in _OF_THE_FIRST_EDITION
     ):
@@ -142,7 +142,7 @@ def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[st
             " make a new home in another folder"
         )
     nobodys = ConfigError(
-        f"{path} is nobody's home; `init --home` makes an operator's, `join` a robot's, `reader NAME` a reader's"
+        f"{path} is not a home; `init --home` makes an operator's, `join` a robot's, `reader NAME` a reader's"
         if kind is None else f"{path} is not {_WHOSE[kind]} home; {mend}"
     )
     head = _load(dict[str, Any], path / "home.json", "restore it from your backup", nobodys)

@@ -91,6 +91,11 @@ class PeerIdentity:
         return self.signing_certificate.to_der() + self.encryption_certificate.to_der()
 
     @property
+    def pair(self) -> tuple[bytes, bytes]:
+        """Both in DER, signing first: what `Trust.check` takes."""
+        return self.signing_certificate.to_der(), self.encryption_certificate.to_der()
+
+    @property
     def pem(self) -> bytes:
         """Both in PEM, signing first: how they stand in files."""
         return self.signing_certificate.to_pem() + self.encryption_certificate.to_pem()
@@ -188,6 +193,7 @@ class Trust:
     ) -> PeerIdentity:  # fmt: skip
         """Who the two certificates (DER) say they are, if all of it holds at `at` (aware UTC).
 
+        What has to hold is the table of docs/log.md (Certificates).
         role: the one expected, or several; name: None for any. Raises a
         subclass of UntrustedCertificate that tells why. Costs two or more
         signature verifications.
@@ -206,9 +212,15 @@ class Trust:
         ):
             purpose = _extended_key_usage(peer.role)
             try:
-                x509.verify_chain(certificate, roots=self.roots, at=at, key_usage=(use,), extended_key_usage=purpose)
+                path = x509.verify_chain(
+                    certificate, roots=self.roots, at=at, key_usage=(use,), extended_key_usage=purpose
+                )  # fmt: skip
             except CertificateError as error:
                 raise UntrustedCertificate(f"the certificate of {peer} is not to be trusted: {error}") from error
+            if len(path) != 2 or certificate.is_ca:
+                raise UntrustedCertificate(f"the certificate of {peer} is a CA's, or was not issued by one")
+            if purpose not in (certificate.extended_key_usage or ()):
+                raise UntrustedCertificate(f"the certificate of {peer} does not say that it is for {purpose}")
             if certificate.key_usage is None or set(other) & set(certificate.key_usage):
                 raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
         roles = (role,) if isinstance(role, Role) else tuple(role)
@@ -316,7 +328,7 @@ def identity_files(identity: Identity, roots: Sequence[x509.Certificate], passwo
 def read_certificates(pem: bytes) -> tuple[x509.Certificate, ...]:
     """Every certificate of a PEM file, in order; IdentityError if there is none or one is malformed."""
     try:
-        return x509.load_pem_certificates(pem)
+        return tuple(x509.Certificate.from_der(one.to_der()) for one in x509.load_pem_certificates(pem))
     except SMCryptoError as error:
         raise IdentityError(f"a certificate cannot be read: {error}") from error
 

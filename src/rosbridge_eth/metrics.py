@@ -300,7 +300,6 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         if address is not None:  # without its port, which is another each time
             SESSION.labels(session.peer.name, address[0]).set(wall)
     CONDITION.labels(f"{process} stores chunks").set(reception.trouble.why is None)
-    CONDITION.labels(f"{process} archives bodies").set(reception.archive_trouble.why is None)
 
 
 def show_submitter(

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import getpass
 import os
+import shlex
+import stat
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 from rosbridge_eth.errors import IdentityError
-
-_PASSWORDS = {"robot", "keystore"}
-"""What is given with --password-file; so is a new reader's, beside the operator's --passphrase-file."""
+from rosbridge_eth.terminal import talk
 
 
 def passphrase_file(
@@ -34,14 +34,14 @@ def read_passphrase(
     name: str, prompt: str, *, file: Path | None = None, configured: Path | None = None, confirm: bool = False,
     environment: Mapping[str, str] = os.environ,
 ) -> bytes:
-    """The passphrase called `name` ("operator", "robot", "reader", "keystore", "ca"), without its line end.
+    """The passphrase called `name` ("operator", "robot", "reader", "ca"), without its line end.
 
     Looked for in `file`, then where `passphrase_file` says, then asked for (twice with `confirm`). IdentityError
     where there is none to be had. configured: the file that server.toml names.
     """
     if file := file or passphrase_file(name, configured=configured, environment=environment):
         return _from_file(file)
-    option = "--password-file" if name in _PASSWORDS or (name == "reader" and confirm) else "--passphrase-file"
+    option = "--password-file" if name == "robot" or (name == "reader" and confirm) else "--passphrase-file"
     if not sys.stdin.isatty():
         raise IdentityError(f"the {name} passphrase is needed and there is no terminal to ask at: give {option}")
     try:
@@ -57,8 +57,16 @@ def read_passphrase(
     return passphrase.encode()
 
 
+def warn_if_others_read(*files: Path) -> None:
+    """Say which of these files other users of this machine may read. OSError."""
+    for file in files:
+        if file.stat().st_mode & (stat.S_IRGRP | stat.S_IROTH):
+            talk(f"{file} may be read by other users of this machine: chmod 600 {shlex.quote(str(file))}")
+
+
 def _from_file(file: Path) -> bytes:
     try:
+        warn_if_others_read(file)
         lines = file.read_bytes().splitlines()
     except OSError as error:
         raise IdentityError(f"cannot read the passphrase file {file}: {error.strerror}") from error

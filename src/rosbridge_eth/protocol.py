@@ -2,16 +2,13 @@
 
     up      WHERE      01 | stream 16 | number 8 | digest 32
             OFFER      02 | chunk
-            PART       03 | at 4 | of 4 | bytes      of a chunk for the archive, from this byte on, of so many in all
     down    STORED     11 | stream 16 | 00, or 01 | number 8 | digest 32     00: nothing of this stream is stored
             CONFIRMED  12 | stream 16 | number 8 | block 8
             HOLD       13 | why, UTF-8, at most 400 bytes
             REFUSED    14 | stream 16 | number 8 | why
-            HAVE       15 | digest 32 | bytes 4      of this chunk, which did not come whole
 
 The robot says which chunk of which stream it would send next; the server answers what it has stored of that
-stream, and the robot goes on from there. A chunk that does not fit one message goes in parts, in order, at most
-64 KiB each. The robot is never named: it is who the channel authenticated.
+stream, and the robot goes on from there. The robot is never named: it is who the channel authenticated.
 """
 
 from __future__ import annotations
@@ -19,15 +16,13 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple, TypeAlias
 
-from rosbridge_eth.chunk import MAX_ARCHIVED_CHUNK, MAX_CHUNK
+from rosbridge_eth.chunk import MAX_CHUNK
 
 MAX_WHY = 400
-MAX_PART = 64 * 1024
 
-_WHERE, _OFFER, _PART, _STORED, _CONFIRMED, _HOLD, _REFUSED, _HAVE = 0x01, 0x02, 0x03, 0x11, 0x12, 0x13, 0x14, 0x15
+_WHERE, _OFFER, _STORED, _CONFIRMED, _HOLD, _REFUSED = 0x01, 0x02, 0x11, 0x12, 0x13, 0x14
 _WHERE_FORM, _STORED_FORM = struct.Struct(">B16sQ32s"), struct.Struct(">B16s?Q32s")
 _PLACE_FORM, _CONFIRMED_FORM = struct.Struct(">B16sQ"), struct.Struct(">B16sQQ")
-_PART_FORM, _HAVE_FORM = struct.Struct(">BII"), struct.Struct(">B32sI")
 
 
 class ProtocolError(Exception):
@@ -46,14 +41,6 @@ class Offer(NamedTuple):
     """Up: one encoded chunk."""
 
     chunk: bytes
-
-
-class Part(NamedTuple):
-    """Up: the bytes of an encoded chunk from `at` on, which has `of` in all."""
-
-    at: int
-    of: int
-    data: bytes | memoryview
 
 
 class Stored(NamedTuple):
@@ -86,15 +73,8 @@ class Refused(NamedTuple):
     why: str
 
 
-class Have(NamedTuple):
-    """Down, before Stored: of the chunk with this digest there are so many bytes; its next part begins there."""
-
-    digest: bytes
-    size: int
-
-
-Up: TypeAlias = Where | Offer | Part
-Down: TypeAlias = Stored | Confirmed | Hold | Refused | Have
+Up: TypeAlias = Where | Offer
+Down: TypeAlias = Stored | Confirmed | Hold | Refused
 
 
 def encode(message: Up | Down) -> bytes:
@@ -104,8 +84,6 @@ def encode(message: Up | Down) -> bytes:
             return _WHERE_FORM.pack(_WHERE, *message)
         case Offer(chunk):
             return bytes((_OFFER,)) + chunk
-        case Part(at, of, data):
-            return b"".join((_PART_FORM.pack(_PART, at, of), data))
         case Stored(stream, number, digest):
             return _STORED_FORM.pack(_STORED, stream, number is not None, number or 0, digest)
         case Confirmed():
@@ -114,8 +92,6 @@ def encode(message: Up | Down) -> bytes:
             return bytes((_HOLD,)) + _reason(why)
         case Refused(stream, number, why):
             return _PLACE_FORM.pack(_REFUSED, stream, number) + _reason(why)
-        case Have():
-            return _HAVE_FORM.pack(_HAVE, *message)
 
 
 def _reason(why: str) -> bytes:
@@ -139,10 +115,6 @@ def decode_up(data: bytes) -> Up:
         return Where(*_WHERE_FORM.unpack(data)[1:])
     if data[:1] == bytes((_OFFER,)) and 1 < len(data) <= 1 + MAX_CHUNK:
         return Offer(data[1:])
-    if data[:1] == bytes((_PART,)) and _PART_FORM.size < len(data) <= _PART_FORM.size + MAX_PART:
-        _, at, of = _PART_FORM.unpack_from(data)
-        if at + len(data) - _PART_FORM.size <= of <= MAX_ARCHIVED_CHUNK:
-            return Part(at, of, memoryview(data)[_PART_FORM.size :])
     raise ProtocolError(f"not a robot's message: {len(data)} bytes")
 
 
@@ -161,6 +133,4 @@ def decode_down(data: bytes) -> Down:
     if kind == _REFUSED and len(data) >= _PLACE_FORM.size:
         _, stream, number = _PLACE_FORM.unpack_from(data)
         return Refused(stream, number, _why(data[_PLACE_FORM.size :]))
-    if kind == _HAVE and len(data) == _HAVE_FORM.size:
-        return Have(*_HAVE_FORM.unpack(data)[1:])
     raise ProtocolError(f"not a server's message: {len(data)} bytes")

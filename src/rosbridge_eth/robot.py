@@ -16,7 +16,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TypeVar
 
@@ -44,6 +44,7 @@ RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread an
 TAKE = 128  # raw messages captured before the network gets its turn again
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
+CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
 SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
@@ -242,7 +243,7 @@ class Robot:
             self._write(record, now)
 
     def _write(self, record: Record, now: float) -> None:
-        self.writer.add(record.line, now, record.definition, topic=record.topic, archived=record.archive)
+        self.writer.add(record.line, now, record.definition, topic=record.topic)
         if record.definition is not None:  # else it is no message
             self.written[record.topic] += 1
 
@@ -318,14 +319,15 @@ class Robot:
             "messages lost, since the spool took nothing":
                 len(self._ring) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
-            "chunks dropped from the full spool": spool.dropped_bodies - self.dropped_before,
+            f"chunks dropped, since the {'disk was full' if self.spool.disk_was_full else 'spool was at its max_size'}":
+                spool.dropped_bodies - self.dropped_before,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]
         parts += [f"{count} {what}" for what, count in lost.items() if count]
-        line = ", ".join([*parts, f"{counted(spool.unstored, 'chunk')} kept for later"])
         if not spool.unstored:
-            return f"{line}."
+            return ", ".join([*parts, "nothing waits for the server."])
+        line = ", ".join([*parts, f"{counted(spool.unstored, 'chunk')} not yet at the server"])
         if sender.refusal is not None:
             return f"{line}: {sender.refusal}."
         if not sender.sessions:
@@ -343,7 +345,16 @@ def certificate_clock(home: RobotHome) -> Callable[[], datetime]:
 
 
 def keep_time(home: RobotHome, seconds: float) -> None:
-    """Keep the time that a server proved, for this clock; on a full disk the next server's will do."""
+    """Keep the time that a server proved, for this clock; on a full disk the next server's will do.
+
+    A clock that is far from the server's is told: every record bears this machine's time.
+    """
+    away = time.time() - seconds
+    if abs(away) > CLOCKS_APART:
+        log.warning(
+            "this machine's clock is %s %s the server's, and every record bears its time: set it (NTP, chrony)",
+            timedelta(seconds=round(abs(away))), "ahead of" if away > 0 else "behind",
+        )  # fmt: skip
     try:
         home.raise_clock_floor(seconds)
     except OSError as error:
@@ -351,8 +362,11 @@ def keep_time(home: RobotHome, seconds: float) -> None:
 
 
 def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
-    """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first."""
-    trust, keys = Trust(roots), []
+    """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first.
+
+    One whose certificates have ended is left out, and named in the log; ConfigError where nobody is left.
+    """
+    trust, keys, now = Trust(roots), [], certificate_clock(home)()
     for path in config.reader_files(home.readers):
         found = read_certificates(path.read_bytes())
         if len(found) != 2:
@@ -360,7 +374,12 @@ def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certi
         signing, encryption = found
         born = max(signing.not_before, encryption.not_before)
         peer = trust.check(signing.to_der(), encryption.to_der(), role=Role.READER, at=born)
-        keys.append(peer.encryption_certificate.public_key)
+        if now > peer.not_after:
+            log.warning("not sealed for %s: its certificate ended at %s", peer, peer.not_after)
+        else:
+            keys.append(peer.encryption_certificate.public_key)
+    if not keys:
+        raise ConfigError("the certificates of all readers have ended, so nobody may open the records: join again")
     return keys
 
 

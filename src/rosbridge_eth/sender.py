@@ -13,15 +13,13 @@ from dataclasses import dataclass
 
 from rosbridge_eth import protocol
 from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason, Unresolved
-from rosbridge_eth.chunk import MAX_CHUNK
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.protocol import MAX_PART, Confirmed, Have, Hold, Offer, Part, ProtocolError, Refused, Stored, Where
+from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
 from rosbridge_eth.spool import Spool
 
 log = logging.getLogger(__name__)
 
 READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
-AHEAD = 8 * 1024 * 1024  # bytes of chunks beyond what the server has stored; no further one is begun then
 SAY_AGAIN = 60.0  # seconds before the same reason why nothing is sent is said once more
 
 
@@ -83,9 +81,6 @@ class Sender:
         self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
         self._stored: int | None = None  # the newest number of it that the server has
         self._asked = False  # a question is out, or a hold is on: nothing is sent until the next Stored
-        self._flying: dict[int, int] = {}  # number of each chunk above `_stored` that was begun -> its bytes
-        self._parts: tuple[memoryview, int] | None = None  # of the chunk that is sent in parts, and what is sent of it
-        self._have = Have(b"", 0)  # what the server said it has of a chunk
         self.statistics = SenderStatistics()
 
     @property
@@ -100,30 +95,15 @@ class Sender:
         if self._stream is None:
             self._ask(self._spool.next_stream(b""))
             return
-        if not self._client.writable() or not self._send_parts() or sum(self._flying.values()) > AHEAD:
+        if not self._client.writable():
             return
         for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
-            encoded, number = chunk.encoded, chunk.header.number
-            if len(encoded) > MAX_CHUNK:
-                self._parts = memoryview(encoded), self._have.size if chunk.header.digest == self._have.digest else 0
-            elif not self._put(Offer(encoded)):
+            if not self._put(Offer(chunk.encoded)):
                 return
-            self._sent, self._flying[number] = number, len(encoded)
+            self._sent = chunk.header.number
             self.statistics.sent += 1
-            if not self._send_parts():
-                return
         if self._sent == self._stored:
             self._ask(self._spool.next_stream(self._stream))
-
-    def _send_parts(self) -> bool:
-        """Send what is left of a chunk that goes in parts; whether nothing is."""
-        while self._parts is not None:
-            encoded, at = self._parts
-            end = min(at + MAX_PART, len(encoded))
-            if not self._put(Part(at, len(encoded), encoded[at:end])):
-                return False
-            self._parts = None if end == len(encoded) else (encoded, end)
-        return True
 
     def _put(self, message: protocol.Up) -> bool:
         """Send it, if there is room."""
@@ -137,8 +117,6 @@ class Sender:
     def _ask(self, place: tuple[bytes, int, bytes] | None) -> None:
         if place is not None and self._put(Where(*place)):
             self._stream, self._sent, self._stored, self._asked = place[0], None, None, True
-            self._parts, self._have = None, Have(b"", 0)
-            self._flying.clear()
 
     def handle(self, event: Event, now: float) -> None:
         """Take one event of the client. StoreError where the spool cannot note it; then it is asked for again."""
@@ -177,8 +155,6 @@ class Sender:
 
     def _take(self, message: protocol.Down, now: float) -> None:
         match message:
-            case Have():
-                self._have = message
             case Stored() if self.statistics.held is not None:  # it takes chunks again: ask from the beginning
                 self._stream, self._asked, self.statistics.held = None, False, None
             case Stored(stream=stream, number=number) if stream == self._stream:
@@ -187,7 +163,6 @@ class Sender:
                     self._sent, self._asked = number, False
                 self._stored = number
                 if number is not None:
-                    self._flying = {above: size for above, size in self._flying.items() if above > number}
                     self._spool.stored(stream, number)
                     self._client.progressed()
                 self._client.expecting(self._sent != self._stored)

@@ -10,6 +10,7 @@ spool is at its bound, or its disk is full, there is room for what is new at the
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -17,6 +18,8 @@ from typing import Final, NamedTuple
 from rosbridge_eth.chunk import Chunk, Log
 from rosbridge_eth.database import Database, DiskFull
 from rosbridge_eth.errors import StoreError
+
+log = logging.getLogger(__name__)
 
 _APPLICATION: Final = 0x52425350  # "RBSP"
 _STORED, _ASIDE, _BARE, _WHOLE = 2, 3, 4, 5
@@ -86,6 +89,8 @@ class Spool:
         self, path: Path, log: Log, *, max_bytes: int, drop: Callable[[Chunk], Chunk], read_only: bool = False
     ) -> None:
         self._max_bytes, self._drop = max_bytes, drop
+        self.disk_was_full = False
+        """Whether old chunks gave way because the disk had no room for a new one, and not because of max_bytes."""
         self._db = Database(
             path, "spool", application=_APPLICATION, schema=_SCHEMA, wal_pages=128, exclusive=True, read_only=read_only
         )
@@ -113,7 +118,10 @@ class Spool:
         size = len(chunk.encoded)
         try:
             self._db.write(lambda: self._append(chunk, size, spare=0))
-        except DiskFull:
+        except DiskFull as error:
+            if not self.disk_was_full:
+                log.warning("%s; until then the oldest chunks give way to new ones", error)
+            self.disk_was_full = True
             self._db.write(lambda: self._append(chunk, size, spare=4 * size + _SPARE))
         self.last_digest = chunk.header.digest
 

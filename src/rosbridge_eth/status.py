@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.console import Group, RenderableType
@@ -26,10 +26,9 @@ from rosbridge_eth.home import HomeKind, OperatorHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role
 from rosbridge_eth.registry import Enrolment, Registry
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
+from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
 
 if TYPE_CHECKING:
-    from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Ledger, Standing
 
 _WEI: Final = 10**18
@@ -37,7 +36,6 @@ ANSWER_TIME = 5.0  # seconds for a node or a monitor
 SPENDING_BLOCKS = 100  # what an account spends is seen by its balance so many blocks ago: geth keeps 128 states
 SEEN = 15.0  # seconds since a worker last saw the session
 FOLLOW_EVERY = 2.0
-PAGE = 200  # rows of the inbox looked through at once
 DEAD = 1000  # dead letters; the inbox keeps no more
 Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
@@ -48,67 +46,6 @@ _SILENT = "what uses the spool shows no figures: what is captured, and whether t
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
              "chain_block": "block", "on_hold": "hold", "waiting_chunks": "chunks", "waiting_seconds": "oldest"}
 """The server's figures of a robot, and what they are called here."""
-
-
-class Located(NamedTuple):
-    """Where a chunk is. state: unknown, stored (in the inbox), written (in a block), confirmed, dead letter.
-
-    proven: what the contract says, asked with checkData; None where no block has it.
-    """
-
-    state: str
-    transaction: str | None = None
-    block: int | None = None
-    proven: bool | None = None
-
-
-def locate(home: OperatorHome, ledger: Ledger, robot: str, stream: str, number: int) -> Located:
-    """Where a robot's chunk is: in the inbox behind what the chain has, or on the chain, by the links of its events."""
-    from eth_hash.auto import keccak
-
-    from rosbridge_eth.supervisor import open_store
-
-    config, tk = load_server_config(home.config), robot_id(robot)
-    with Registry(home.registry) as registry:
-        if tk not in registry.robots():
-            raise IdentityError(f"no robot {robot!r} is enrolled; `status` lists the names")
-    if len(stream) != 32 or not set(stream.lower()) <= set("0123456789abcdef"):
-        raise ConfigError(f"the stream is 32 hex digits, as `read --json` shows it, not {stream!r}")
-    [standing], wanted, found = ledger.standings([tk]), (bytes.fromhex(stream), number), Located("unknown")
-    with suppress(NothingThere), closing(open_store(config, home, read_only=True)) as inbox:
-        found = _in_inbox(inbox, tk, standing, wanted)
-    for event in () if found.state == "stored" else ledger.newest_data(tk, standing.data_block):
-        for index, encoded in reversed([*enumerate(event.chunks)]):
-            header = Chunk.parse(encoded).header
-            if (header.stream, header.number) == wanted:
-                deep = event.block <= ledger.block_number() - config.chain.confirmations + 1
-                hashes = [keccak(chunk) for chunk in event.chunks]
-                proven = ledger.check_data(tk, event.first, hashes, index, encoded)
-                transaction = "0x" + event.transaction.hex()
-                return Located("confirmed" if deep else "written", transaction, event.block, proven)
-            if header.stream == wanted[0] and header.number < number:
-                return found  # what is before it in the log is before it on the chain
-    return found
-
-
-def _in_inbox(inbox: Inbox, tk: bytes, standing: Standing, wanted: tuple[bytes, int]) -> Located:
-    """Whether it waits behind what the chain has, or is given up."""
-    head = inbox.head(tk, wanted[0])
-    after = inbox.find(tk, standing.tail) if standing.chunks else None
-    while head is not None and head.number >= wanted[1] and (rows := inbox.rows(tk, after, PAGE)):
-        if wanted in map(_place, inbox.chunks(tk, [row.position for row in rows])):
-            return Located("stored")
-        after = rows[-1].position
-    dead = wanted in (_place(letter.chunk) for letter in inbox.dead(DEAD) if letter.tk == tk)
-    return Located("dead letter" if dead else "unknown")
-
-
-def _place(encoded: bytes) -> tuple[bytes, int]:
-    header = Chunk.parse(encoded).header
-    return header.stream, header.number
-
-
-# What is asked
 
 
 @contextmanager
@@ -157,12 +94,17 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
             of[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
 
 
-def _operator(place: OperatorHome) -> Report:
+def _operator(place: OperatorHome, name: str | None = None) -> Report:
+    """name: of the only robot that is looked at, and how far its log is on the chain."""
     from rosbridge_eth.ledger import Ledger
 
     config = load_server_config(place.config)
     with Registry(place.registry) as registry:
         enrolled, robots = registry.all(), registry.robots()
+    if name is not None:
+        if (tk := robot_id(name)) not in robots:
+            raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
+        robots = {tk: robots[tk]}
     report: Report = {
         "names": [
             {"role": each.role, "name": each.name, "enrolled": each.enrolled_at,
@@ -192,6 +134,8 @@ def _operator(place: OperatorHome) -> Report:
                 report["wrong_chain"] = str(error)
                 raise
             _add_standings(report, ledger, robots, round(config.funds.by * _WEI))
+            if name is not None:
+                report["robots"][name]["log"] = _log(ledger, tk, head.number - config.chain.confirmations + 1)
     report["alarms"] = [*_alarms(report)]
     return report
 
@@ -204,7 +148,7 @@ def fleet(place: OperatorHome) -> RenderableType:
             report["robots"] = {robot.name: {"in_force": True} for robot in registry.robots().values()
                                 if robot.revoked_at is None}  # fmt: skip
     except BridgeError as error:  # of a file that is changed at this moment
-        return Text(str(error))
+        return plain(str(error))
     _add_figures(report, _running(report, place.path, _NO_SERVER))
     return Group(_robots(report, money=False), *map(Text, _alarms(report)))
 
@@ -247,6 +191,20 @@ def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolm
             "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
         }  # fmt: skip
     operator["days_left"] = _days(treasury, total, seconds)
+
+
+def _log(ledger: Ledger, tk: bytes, confirmed: int) -> dict[str, Report | None]:
+    """The last chunk of the robot's log that the chain has, and the last one up to the block `confirmed`."""
+    [standing] = ledger.standings([tk])
+    log: dict[str, Report | None] = {"written": None, "confirmed": None}
+    for event in ledger.newest_data(tk, standing.data_block):
+        header = Chunk.parse(event.chunks[-1]).header
+        place = {"stream": header.stream.hex(), "number": header.number, "block": event.block,
+                 "transaction": "0x" + event.transaction.hex()}  # fmt: skip
+        log["written"] = log["written"] or place
+        if event.block <= confirmed:
+            return log | {"confirmed": place}
+    return log
 
 
 def _days(balance: float, spent: int, seconds: int) -> float | None:
@@ -343,6 +301,12 @@ def _show_operator(report: Report) -> Iterator[RenderableType]:
         ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
         *_process(report),
     ])  # fmt: skip
+    for name, robot in report["robots"].items():
+        for state, place in robot.get("log", {}).items():
+            yield f"{name}: {state} " + ("is nothing" if place is None else (
+                f"up to chunk {place['number']} of stream {place['stream']}, in block {place['block']},"
+                f" transaction {place['transaction']}"
+            ))  # fmt: skip
     yield from report["alarms"]
     for name, each in {"operator": report["operator"], **report["robots"]}.items():
         if each["account"]:
@@ -363,24 +327,27 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
     ])  # fmt: skip
 
 
-def _look(path: Path) -> tuple[Report, list[RenderableType]]:
-    """The report on a home, and how it is shown."""
+def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
+    """The report on a home, or on one robot of it, and how it is shown."""
     kind = kind_of(path)
     match kind:
         case HomeKind.OPERATOR:
-            shown = _show_operator(report := _operator(OperatorHome(path)))
+            shown = _show_operator(report := _operator(OperatorHome(path), robot))
         case HomeKind.ROBOT:
+            if robot is not None:
+                raise ConfigError(f"{path} is the home of one robot; leave its name out")
             shown = _show_robot(report := _robot(RobotHome(path)))
         case HomeKind.READER:
             raise ConfigError(f"a reader's home has nothing that goes on; try it with `doctor --home {path}`")
-    return {"kind": kind, **report}, [Text(each) if isinstance(each, str) else each for each in shown]
+    return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth status --home robot")(status)
+    app.command(epilog="Example: rosbridge-eth status robot_1; rosbridge-eth status --home robot")(status)
 
 
 def status(
+    robot: Annotated[str | None, typer.Argument(help="This one alone, and how far its log is on the chain.")] = None,
     home: AnyHomeOption = OPERATOR_HOME,
     follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
     json: Json = False,
@@ -392,13 +359,13 @@ def status(
     """
     from rich.live import Live
 
-    report, shown = _look(home)
+    report, shown = _look(home, robot)
     if follow and not json:
         with Live(console=data, auto_refresh=False) as live:
             while True:
                 live.update(Group(*shown, *map(Text, report["unknown"])), refresh=True)
                 time.sleep(FOLLOW_EVERY)
-                report, shown = _look(home)
+                report, shown = _look(home, robot)
     if json:
         print_json(report)
     else:

@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING
 
 from rosbridge_eth import metrics
 from rosbridge_eth.administration import server_trust
-from rosbridge_eth.archive import check_settings, open_archive
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import ServerConfig as Settings
@@ -57,7 +56,7 @@ GIVE_UP_AFTER = 6  # short lives in a row: half a minute of trying
 PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
 """Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
 
-TAKEN_UP = ("channel", "chain", "store", "archive", "funds")
+TAKEN_UP = ("channel", "chain", "store", "funds")
 """Keys of server.toml that SIGHUP takes up: those that the parent, its sockets and certificates do not rest on."""
 
 SUBMITTER, MONITOR = "submitter", "monitor"
@@ -101,8 +100,7 @@ def open_reception(
     """The door of one worker."""
     channel = ServerConfig(modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number)
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
-    archive = None if config.archive is None else open_archive(config.archive)
-    return Reception(server, inbox, deployment.ledger, registry.in_force, archive)
+    return Reception(server, inbox, deployment.ledger, registry.in_force)
 
 
 def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
@@ -208,8 +206,6 @@ class Supervisor:
             ledger.check()
         with closing(open_store(config, self._home)) as inbox:
             inbox.check()
-        if config.archive is not None:
-            check_settings(config.archive)
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
         self._starts[name] += 1

@@ -22,7 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.logs import LogFormat, speaks_json
+from rosbridge_eth.logs import LogFormat, one_line, speaks_json
 
 log = logging.getLogger(__name__)
 
@@ -63,11 +63,12 @@ def read_given(path: Path, limit: int = -1) -> bytes:
 
 
 def talk(text: str) -> None:
-    """A line for the person at the terminal; never parsed as markup. An event, where stderr carries JSON."""
+    """A line for the person at the terminal; nothing in it is markup or acts on the terminal. An event, where stderr
+    carries JSON."""
     if speaks_json():
         log.warning("%s", text)
         return
-    errors.print(text, markup=False)
+    errors.print(one_line(text), markup=False)
 
 
 @contextmanager
@@ -109,6 +110,11 @@ def live(make: Callable[[], RenderableType]) -> Iterator[Callable[[], None]]:
         errors.file = sys.stderr
 
 
+def plain(text: str) -> Text:
+    """For a picture or table: nothing in it is markup or acts on the terminal. It may have several lines."""
+    return Text("\n".join(map(one_line, text.split("\n"))))
+
+
 def print_json(value: Any) -> None:
     """One JSON value on stdout, for programs. In ASCII: what a robot wrote does not act on a terminal."""
     sys.stdout.write(json.dumps(value) + "\n")
@@ -123,5 +129,5 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], 
     for index, column in enumerate(columns):
         made.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
-        made.add_row(*(Text(str(cell)) for cell in row))
+        made.add_row(*(plain(str(cell)) for cell in row))
     return made

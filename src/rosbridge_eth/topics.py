@@ -13,7 +13,7 @@ import json as jsonlib
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -30,6 +30,8 @@ from rosbridge_eth.terminal import ROBOT_HOME, Json, RobotHomeOption, data, prin
 from rosbridge_eth.writer import LogWriter
 from smcrypto import sm2
 
+PLUMBING = {"/rosout", "/rosout_agg", "/parameter_events", "/clock"}
+"""Topics of ROS itself, which `join` suggests to leave out."""
 ANYTHING = RobotConfig.model_validate({"topics": ["**"]})
 DAY = 86_400.0
 SIMULATED = 60 * 10**9  # ns of a simulation without an end that are looked at
@@ -75,8 +77,8 @@ def offered(source: Source) -> list[Offer]:
     return offers
 
 
-Line: TypeAlias = tuple[float, bytes, bool]
-"""When it was captured, the line, and whether it is for the archive."""
+Line: TypeAlias = tuple[float, bytes]
+"""When it was captured, and the line."""
 
 
 @dataclass(slots=True)
@@ -101,8 +103,13 @@ class Heard:
         return self.lines if self.rate and not self.trigger else []
 
 
-def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, Any]:
-    """Listen for so many seconds at most; what `topics --json` prints. Raises SourceError, ConfigError."""
+def survey(
+    config: RobotConfig, seconds: float, readers: int = 1, without: Collection[str] = ()
+) -> dict[str, Any]:
+    """Listen for so many seconds at most; what `topics --json` prints. Raises SourceError, ConfigError.
+
+    without: topics that are not taken, although the configuration names them.
+    """
     from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_cost
 
     source, stop, room = everything(config), threading.Event(), [ENOUGH]
@@ -115,7 +122,7 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
         topic.size += len(raw.raw)
         if record := capture.process(raw, raw.received_ns):
             topic.trigger = record.trigger
-            topic.lines.append((raw.received_ns / 1e9, record.line, record.archive))
+            topic.lines.append((raw.received_ns / 1e9, record.line))
             room[0] -= len(record.line)
         if room[0] < 0:
             stop.set()
@@ -131,21 +138,20 @@ def survey(config: RobotConfig, seconds: float, readers: int = 1) -> dict[str, A
     times = [time for topic in heard.values() for time in topic.times]
     took = time.monotonic() - began if source.live else (max(times) - min(times)) / 1e9 if times else 0.0
     selection, days = config.selection(), max(took, 1.0) / DAY
-    chosen = [topic for topic in heard.values() if selection.wants(topic.offer)]
+    chosen = [topic for topic in heard.values() if selection.wants(topic.offer) and topic.offer.topic not in without]
     chunks = _sealed([line for topic in chosen for line in topic.all_day], config, source.kind, readers)
-    sizes = [len(chunk.on_chain.encoded) for chunk in chunks]
+    sizes = [len(chunk.encoded) for chunk in chunks]
     bodies = {
-        name: [sum(len(chunk.body) for chunk in sealed if chunk.header.archived is archived) / days
-               for archived in (False, True)]
-        for name, topic in heard.items() for sealed in [_sealed(topic.all_day, config, source.kind, readers)]
-    }  # fmt: skip
+        name: sum(len(chunk.body) for chunk in _sealed(topic.all_day, config, source.kind, readers)) / days
+        for name, topic in heard.items()
+    }
     return {
         "seconds": took,
         "topics": [
             {"topic": name, "type": topic.offer.type_name, "nodes": list(topic.offer.nodes),
              "chosen": topic in chosen, "trigger": topic.trigger,
              "messages": (count := len(topic.times)), "rate": topic.rate, "size": topic.size / count if count else None,
-             "bytes_per_day": sum(bodies[name]), "gas_per_day": GAS_A_BYTE * bodies[name][0]}
+             "bytes_per_day": bodies[name], "gas_per_day": GAS_A_BYTE * bodies[name]}
             for name, topic in sorted(heard.items())
         ],
         "chunks_per_day": len(sizes) / days, "bytes_per_day": sum(sizes) / days,
@@ -165,8 +171,8 @@ def _sealed(lines: list[Line], config: RobotConfig, kind: str, readers: int) -> 
         stream_line=stream_line(kind, ""), period=config.log.period, compress=config.log.compress,
     )
     chunks = []
-    for at, line, archived in lines:
-        writer.add(line, at, archived=archived)
+    for at, line in lines:
+        writer.add(line, at)
         chunks += writer.closed(at, 0)
     return chunks + writer.finish(0)
 
@@ -186,27 +192,29 @@ def topics(
 ) -> None:  # fmt: skip
     """List what there is to capture, and what it costs a day. With types, rates, sizes, and what robot.toml takes.
 
-    Without a robot.toml, everything is taken.
+    Without a robot.toml, everything is taken but the topics of ROS itself, as `join --yes` chooses.
     """
     place = RobotHome(home)
-    config = load_robot_config(place.config) if place.config.exists() else ANYTHING
+    configured = place.config.exists()
+    config = load_robot_config(place.config) if configured else ANYTHING
     if source is not None:
         named = parse_config(RobotConfig, robot_toml(["**"], source), place.config).source
         config = config.model_copy(update={"source": named})
     joined = config.readers or [*place.readers.glob("*.pem")]
-    report = survey(config, seconds, len(config.reader_files(place.readers)) if joined else 1)
+    report = survey(config, seconds, len(config.reader_files(place.readers)) if joined else 1,
+                    () if configured else PLUMBING)
     if json:
         print_json(report)
         return
-    columns = ["topic", "type", "Hz", "bytes", "taken", "MB a day", "Ggas a day"]
+    columns = ["topic and type", "Hz", "bytes", "taken", "MB a day", "Ggas a day"]
     rows = [
-        (each["topic"], each["type"], "" if each["rate"] is None else f"{each['rate']:.3g}",
+        (f"{each['topic']}\n  {each['type']}", "" if each["rate"] is None else f"{each['rate']:.3g}",
          "" if each["size"] is None else f"{each['size']:.0f}",
          f"at {each['trigger']}" if each["trigger"] else "yes" if each["chosen"] else "",
          f"{each['bytes_per_day'] / 1e6:.3g}", f"{each['gas_per_day'] / 1e9:.3g}")
         for each in report["topics"]
     ]  # fmt: skip
-    data.print(table(f"Topics, as heard in {report['seconds']:.0f} s", columns, rows, right=[2, 3, 5, 6]))
+    data.print(table(f"Topics, as heard in {report['seconds']:.0f} s", columns, rows, right=[1, 2, 4, 5]))
     low, high = report["gas_per_day"]["full_batches"] / 1e9, report["gas_per_day"]["one_chunk_each"] / 1e9
     talk(
         f"What is taken makes {report['bytes_per_day'] / 1e6:.3g} MB a day in {report['chunks_per_day']:.0f} chunks"

@@ -4,12 +4,9 @@ A chunk is closed `period` seconds after its first line, at 1,000 records or at 
 comes first; one that does not fit is cut in two. After `heartbeat` seconds without a chunk one without
 records is sealed, so that silence can be told from withholding.
 
-Lines for the archive are gathered apart, up to 4 MiB, and make archived chunks of the same stream.
-
 Every stream begins with its `{"stream": ...}` line, and the definition of a type stands before the first
-message of that type in it, and again where it changes; both on the chain, so that they are there where a body
-of the archive is not, and so does the goodbye. The header of each chunk names the digest of the one before,
-across streams too.
+message of that type in it, and again where it changes. The header of each chunk names the digest of the one
+before, across streams too.
 
 Not here: what a line says (capture), where chunks are kept (spool). No clock: `now` is seconds of a clock
 that does not jump, `wall_ms` milliseconds since 1970.
@@ -22,25 +19,11 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from rosbridge_eth import chunk
-from rosbridge_eth.chunk import MAX_ARCHIVED_LINE, MAX_LINE, MAX_RECORDS, MAX_TIME_MS, Chunk, Log, Randomness, TooLarge
+from rosbridge_eth.chunk import MAX_LINE, MAX_RECORDS, MAX_TIME_MS, Chunk, Log, Randomness, TooLarge
 from smcrypto import sm2
 
 #: Bytes of lines at which a chunk is closed.
-MAX_JSON, MAX_ARCHIVED_JSON = 256 * 1024, 4 * 1024 * 1024
-
-
-class _Lines:
-    """Lines that wait for a chunk of one kind, each as `add` was given it: time, line, definition, topic."""
-
-    def __init__(self, archived: bool) -> None:
-        self.archived, self.most = archived, MAX_ARCHIVED_JSON if archived else MAX_JSON
-        self.waiting: deque[tuple[float, bytes, tuple[str, bytes] | None, str]] = deque()
-        self.bytes = 0
-
-    def due(self, period: float, begun: float | None = None) -> float:
-        """When they make a chunk; begun: of one that is due without a line, too."""
-        first = begun if begun is not None else self.waiting[0][0] if self.waiting else float("inf")
-        return first if len(self.waiting) >= MAX_RECORDS or self.bytes >= self.most else first + period
+MAX_JSON = 256 * 1024
 
 
 class LogWriter:
@@ -49,7 +32,7 @@ class LogWriter:
     readers: 1 to 16 SM2 encryption keys. previous: the digest of the newest header this robot is known to have
     sealed, zeros if none is. stream_line: the first line of every stream; it counts as a record, so that a
     start shows in the log after `period` even if nothing is captured. A line and a definition have at most
-    MAX_LINE bytes, a line for the archive MAX_ARCHIVED_LINE; `add` raises TooLarge for a longer one.
+    MAX_LINE bytes; `add` raises TooLarge for a longer one.
     period and heartbeat: seconds, above 0.
     """
 
@@ -65,7 +48,8 @@ class LogWriter:
         self._period, self._heartbeat, self._compress = period, heartbeat, compress
         self._randomness = randomness
         self._now = self._last_chunk = now
-        self._chain, self._archive = _Lines(False), _Lines(True)
+        self._waiting: deque[tuple[float, bytes, tuple[str, bytes] | None, str]] = deque()  # as `add` was given them
+        self._bytes = 0
         self.sealed = Counter[str]()
         """Lines that are in chunks, by the topic that `add` was told."""
         self.new_stream()
@@ -83,88 +67,78 @@ class LogWriter:
             self._readers = tuple(readers)
             self._defined.clear()
 
-    def add(
-        self, line: bytes, now: float, definition: tuple[str, bytes] | None = None, *, topic: str = "",
-        archived: bool = False,
-    ) -> None:
+    def add(self, line: bytes, now: float, definition: tuple[str, bytes] | None = None, *, topic: str = "") -> None:
         """Take one line in. Call `closed` afterwards, or when `next_timer` says.
 
         definition: a type, and the line that defines it, which goes before this one unless the stream has said it
-        already, and nothing else of that type since. archived: it goes into a chunk for the archive.
+        already, and nothing else of that type since.
         """
-        _check(line, MAX_ARCHIVED_LINE if archived else MAX_LINE)
+        _check(line)
         if definition is not None:
             _check(definition[1])
         self._now = now
-        of = self._archive if archived else self._chain
-        of.waiting.append((now, line, definition, topic))
-        of.bytes += len(line)
+        self._waiting.append((now, line, definition, topic))
+        self._bytes += len(line)
 
     def next_timer(self) -> float:
         """When `closed` has something to give; in the past if it has now."""
-        if self._number and not self._chain.waiting and not self._archive.waiting:
+        if self._number and not self._waiting:
             return self._last_chunk + self._heartbeat
-        chain = self._chain.due(self._period, None if self._number else self._begun)
-        return min(chain, self._archive.due(self._period))
+        first = self._waiting[0][0] if self._number else self._begun
+        return first if len(self._waiting) >= MAX_RECORDS or self._bytes >= MAX_JSON else first + self._period
 
     def closed(self, now: float, wall_ms: int) -> list[Chunk]:
         """The chunks that are due, oldest first. They have to be kept in this order."""
         self._now = now
         chunks: list[Chunk] = []
         while now >= self.next_timer():
-            due = self._archive.due(self._period) <= now
-            chunks += self._seal_next(self._archive if due else self._chain, wall_ms)
+            chunks += self._seal_next(wall_ms)
         return chunks
 
     def finish(self, wall_ms: int) -> list[Chunk]:
         """The rest; the last chunk says goodbye. What may come after it takes a new stream."""
         chunks: list[Chunk] = []
-        while self._archive.waiting:
-            chunks += self._seal_next(self._archive, wall_ms)
         while not chunks or not chunks[-1].header.goodbye:
-            chunks += self._seal_next(self._chain, wall_ms, last=True)
+            chunks += self._seal_next(wall_ms, last=True)
         return chunks
 
-    def _seal_next(self, of: _Lines, wall_ms: int, *, last: bool = False) -> list[Chunk]:
-        """The next lines as a chunk, behind one for the chain with what has to be said before lines for the archive."""
-        before = [] if self._number else [self._stream_line]
-        lines: list[bytes] = [] if of.archived else before
-        size = sum(map(len, before))
-        while of.waiting and size < of.most:
-            _, line, definition, topic = of.waiting[0]
+    def _seal_next(self, wall_ms: int, *, last: bool = False) -> list[Chunk]:
+        """The next lines as a chunk, each behind what has to be said before it."""
+        lines = [] if self._number else [self._stream_line]
+        size = sum(map(len, lines))
+        while self._waiting and size < MAX_JSON:
+            _, line, definition, topic = self._waiting[0]
             said = definition is None or self._defined.get(definition[0]) == definition[1]
-            new = [] if said or definition is None else [definition[1]]
-            if len(lines) + len(new) >= MAX_RECORDS or (of.archived and lines and new):
+            new = [line] if said or definition is None else [definition[1], line]
+            if len(lines) + len(new) > MAX_RECORDS:
                 break
             self._defined |= [definition] if definition is not None else []
-            before += new
-            lines.append(line)
-            size += sum(map(len, new)) + len(line)
-            of.bytes -= len(line)
+            lines += new
+            size += sum(map(len, new))
+            self._bytes -= len(line)
             self.sealed[topic] += 1
-            of.waiting.popleft()
-        first = self._seal(before, wall_ms, archived=False, goodbye=False) if of.archived and before else []
-        return first + self._seal(lines, wall_ms, archived=of.archived, goodbye=last and not of.waiting)
+            self._waiting.popleft()
+        return self._seal(lines, wall_ms, goodbye=last and not self._waiting)
 
-    def _seal(self, lines: list[bytes], wall_ms: int, *, archived: bool, goodbye: bool) -> list[Chunk]:
+    def _seal(self, lines: list[bytes], wall_ms: int, *, goodbye: bool) -> list[Chunk]:
         """The lines as one chunk, or as several where they do not fit one."""
         try:
             sealed = chunk.seal(
                 self._log, self._key, lines, stream=self.stream, number=self._number, previous=self._previous,
                 sealed_ms=min(max(wall_ms, 0), MAX_TIME_MS - 1), readers=self._readers, goodbye=goodbye,
-                archived=archived, compress=self._compress, randomness=self._randomness,
+                compress=self._compress, randomness=self._randomness,
             )  # fmt: skip
         except TooLarge:
             middle = len(lines) // 2
-            first = self._seal(lines[:middle], wall_ms, archived=archived, goodbye=False)
-            return first + self._seal(lines[middle:], wall_ms, archived=archived, goodbye=goodbye)
+            first = self._seal(lines[:middle], wall_ms, goodbye=False)
+            return first + self._seal(lines[middle:], wall_ms, goodbye=goodbye)
         self._number, self._previous, self._last_chunk = self._number + 1, sealed.header.digest, self._now
         return [sealed]
 
 
-def _check(line: bytes, most: int = MAX_LINE) -> bytes:
-    if len(line) > most:
-        raise TooLarge(f"a line of {len(line)} bytes does not fit a chunk; the most is {most}")
+def _check(line: bytes) -> bytes:
+    if len(line) > MAX_LINE:
+        raise TooLarge(f"a line of {len(line)} bytes does not fit a chunk; the most is {MAX_LINE}")
     if not line or b"\n" in line:
         raise ValueError("a line is not empty and holds no newline")
     return line

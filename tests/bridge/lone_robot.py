@@ -32,7 +32,7 @@ def lone_robot(folder: Path) -> RobotHome:
     request = ask_to_join(home, END.robot, PASSWORD)
     peer = ids.enrol_requests(CA, ids.Role.ROBOT, END.robot, request.signing, request.encryption, at=NOW)
     certificates = {name: text.decode() for name, text in ids.certificate_files(peer, [CA.certificate]).items()}
-    join(home, Bundle(END, certificates, {"owner": READER.public.pem.decode()}))
+    join(home, Bundle(END, certificates, {"owner": READER.public.pem.decode()}).signed(CA.key))
     (folder / "word").write_bytes(PASSWORD)
     return home
 

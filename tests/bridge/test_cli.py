@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 from bridge.operations.conftest import Place, _made, place
-from rosbridge_eth.cli import run
+from rosbridge_eth import terminal
+from rosbridge_eth.cli import GROUPS, app, run
+from rosbridge_eth.cli.reader import DAY_NS, _choice_of
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.ledger.nodes import Anvil, free_port
@@ -66,6 +68,33 @@ def test_a_robot_with_a_mistake_in_its_configuration_says_which(text: str, says:
     assert says in error and "Traceback" not in error
 
 
+def test_what_others_may_read_is_told(place: Place, capsys: Capture) -> None:
+    """The keys are encrypted; whoever reads them and the password has the robot's identity."""
+    Path("robot/robot.toml").write_text('topics = ["/robot_2/odom"]\n[source]\nkind = "sim"')
+    key = next(Path("robot/identity").glob("*.key.pem"))
+    for file, mode, told in ((key, 0o644, True), (Path("word"), 0o640, True), (key, 0o600, False)):
+        Path("word").chmod(0o600)
+        key.chmod(0o600)
+        file.chmod(mode)
+        run(["robot", "--password-file", "word"])
+        assert (f"{file} may be read by other users" in capsys.readouterr().err) is told
+
+
+def test_help_is_grouped_and_has_every_command(capsys: Capture) -> None:
+    assert run(["--help"]) == 0
+    shown = capsys.readouterr().out
+    assert [line for line in shown.splitlines() if re.fullmatch(r"[A-Z][a-z]+:", line)][-4:] == [
+        "All:", "Operator:", "Robot:", "Reader:"]
+    named = [name for names in GROUPS.values() for name in names]
+    assert sorted(named) == sorted(command.name or command.callback.__name__ for command in app.registered_commands)
+
+
+def test_a_date_is_a_whole_day() -> None:
+    choice = _choice_of(None, "2026-11-21", "2026-11-22", None)
+    assert (choice.from_ns, choice.to_ns) == (1_795_219_200_000_000_000, 1_795_219_200_000_000_000 + 2 * DAY_NS)
+    assert _choice_of(None, None, None, "2026-11-21").at_ns == 1_795_219_200_000_000_000
+
+
 def test_a_missing_home_names_the_command_that_makes_it(capsys: Capture) -> None:
     fails(capsys, ExitCode.CONFIG, "join", "robot", "--home", "nowhere", "--password-file", "word")
     fails(capsys, ExitCode.CONFIG, "init", "status", "--home", "nowhere")
@@ -111,7 +140,6 @@ def test_a_node_that_does_not_answer_is_told(capsys: Capture) -> None:
     fails(capsys, ExitCode.CHAIN, "deploy", "server", *OPERATOR)
     Path("deployment.kept").rename("operator/deployment.json")
     fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "server", *OPERATOR)
-    fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "check", "robot_1", "0f" * 16, "0")
     fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "read", "robot_1", "--passphrase-file", "readers")
     fails(capsys, ExitCode.CHAIN, "half done", "revoke", "robot_1", "--compromised", *OPERATOR)
     assert run(["status", "--json"]) == 0
@@ -174,7 +202,6 @@ def test_usage_errors_end_with_2(capsys: Capture) -> None:
     assert run(["read"]) == ExitCode.USAGE
     assert run(["read", "robot_1", "--at", "2026-11-21T10:00:00Z", "--to", "2026-11-22T10:00:00Z"]) == ExitCode.USAGE
     assert run(["read", "robot_1", "--from", "2026-11-22T10:00:00Z", "--to", "2026-11-21T10:00:00Z"]) == ExitCode.USAGE
-    assert run(["check", "robot_1", "0f" * 16, "-1"]) == ExitCode.USAGE
 
 
 def test_version_and_help_are_there_in_short_and_long(capsys: Capture) -> None:
@@ -306,20 +333,14 @@ def test_a_home_is_copied_and_its_passphrase_changed(place: Place, capsys: Captu
         assert run(["passwd", "--home", home, "--passphrase-file", secret, "--new-passphrase-file", "new"]) == 0
 
 
-def test_an_account_is_exported_for_other_software(place: Place, capsys: Capture) -> None:
+def test_the_words_open_the_accounts_in_other_software(place: Place, capsys: Capture) -> None:
+    """By BIP-39 and BIP-44, as any wallet derives them; so no keystore is written here."""
     from eth_account import Account
 
-    for name in ("operator", "robot_1"):
-        assert run(["export", name, f"{name}.json", *OPERATOR, "--password-file", "word"]) == 0
-        exported = json.loads(Path(f"{name}.json").read_bytes())
-        address = Account.from_key(Account.decrypt(exported, Path("word").read_text())).address
-        assert (address == place.operator.account) == (name == "operator")
-        assert address in capsys.readouterr().err
-        assert Path(f"{name}.json").stat().st_mode & 0o077 == 0
-    ours = (*OPERATOR, "--password-file", "word")
-    fails(capsys, ExitCode.CONFIG, "exists", "export", "operator", "operator.json", *ours)
-    fails(capsys, ExitCode.IDENTITY, "`status` lists", "export", "robot_9", "x.json", *ours)
-    assert not Path("x.json").exists()
+    Account.enable_unaudited_hdwallet_features()
+    assert run(["mnemonic", *OPERATOR]) == 0
+    words = capsys.readouterr().out.strip()
+    assert Account.from_mnemonic(words, account_path="m/44'/60'/0'/0/0").address == place.operator.account
 
 
 def test_the_shell_completes_commands_and_options() -> None:
@@ -348,3 +369,12 @@ def test_python_3_10_is_told_that_the_bridge_needs_a_newer_one() -> None:
     assert done.stderr.splitlines()[-1] == (
         "ImportError: rosbridge_eth, the bridge, needs Python 3.11 or later; smcrypto, the library, does with 3.10"
     )
+
+
+def test_nothing_that_comes_from_elsewhere_acts_on_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    foreign = "a\x1b[2J\u202e\x9b31m\rb\nc [bold]d"
+    terminal.talk(foreign)
+    terminal.errors.print(terminal.table("t", ["one"], [[foreign]]))
+    said = capsys.readouterr().err
+    assert "a\\x1b[2J\\u202e\\x9b31m\\rb\\nc [bold]d\n" in said
+    assert all(line.isprintable() for line in said.splitlines())

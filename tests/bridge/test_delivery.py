@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import random
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from pathlib import Path
@@ -245,6 +247,31 @@ def test_an_exchanged_inbox_is_noticed_while_nobody_sends_and_filled_again(
     assert world.stored() == []
     assert world.run(60, until=lambda: len(world.stored()) == 10)
     assert world.stored_lines() == world.lines
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_an_old_copy_that_is_put_back_while_the_server_runs_loses_nothing(
+    tmp_path: Path, seed: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """SQLite's own backup writes into the file that is in use: neither its name nor its inode changes."""
+    world = World(tmp_path, seed, BAD)
+    file, copy = tmp_path / "inbox.sqlite", tmp_path / "copy"
+    for turn in range(30):
+        world.capture(10)
+        world.run(world.random.uniform(0, 2), until=lambda: False)
+        if turn % 7 == 2:
+            backup(file, copy)
+        elif turn % 7 == 6:
+            backup(copy, file)
+    assert world.run(300)
+    assert world.stored_lines() == world.lines
+    world.assert_linked()
+    assert "an old copy of the inbox" in caplog.text and "all sessions begin anew" in caplog.text
+
+
+def backup(source: Path, target: Path) -> None:
+    with closing(sqlite3.connect(source)) as read, closing(sqlite3.connect(target, timeout=30)) as written:
+        read.backup(written)
 
 
 def test_another_chunk_under_the_same_number_is_refused_and_a_new_stream_begins(tmp_path: Path) -> None:

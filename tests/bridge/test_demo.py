@@ -104,4 +104,6 @@ def test_the_command_prints_the_stages_and_leaves_a_report(tmp_path: Path) -> No
     assert re.search(r"records equal to the bag's +300 .*Transactions to 0x.*0x", done.stdout.decode(), re.DOTALL)
     assert (tmp_path / "report" / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     assert len((tmp_path / "report" / "records.jsonl").read_text().splitlines()) == 300
-    assert "Every record came back" in (tmp_path / "report" / "report.html").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "Every record came back" in page and "<pre" not in page
+    assert re.search(r'<h2>Records</h2>.*<td>records captured<td class="number">300<tr>', page)

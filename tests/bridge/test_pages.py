@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from bridge.archive.bags import bag_of_images
 from bridge.pages import ROOT, type_page
 from bridge.sources.ros2.graph import free_domain, ros2_python
 from conftest import unavailable
@@ -125,12 +124,6 @@ def test_evidence(place: Path, made: tuple[Path, Anvil]):
     shown = json.loads((place / "shown.json").read_text())
     assert len(shown["records"]) == 50 and len((place / "records.jsonl").read_text().splitlines()) == 1
     assert b"<html" in (place / "moment.html").read_bytes()
-
-
-def test_archive(place: Path):
-    bag_of_images(place / "drive.bag")
-    (place / "robot" / "robot.toml").unlink()
-    type_page("howto-archive.md", place)
 
 
 def test_redis(place: Path, require: Callable[[str], str]):

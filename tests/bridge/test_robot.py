@@ -106,7 +106,7 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
     assert robot.captured == 3 * RING
     assert "the spool: the disk is full" in caplog.text
     assert "the spool: well again" in caplog.text
-    assert f"{robot.chunks} chunks kept for later" in robot.summary
+    assert f"{robot.chunks} chunks not yet at the server" in robot.summary
 
 
 def test_a_spool_that_cannot_be_read_does_not_end_a_robot(
@@ -221,7 +221,7 @@ def test_what_the_spool_took_nothing_of_until_the_end_is_not_said_to_be_kept(
     Full(robot, monkeypatch)
     robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
     assert f"{robot.chunks} chunks lost, since the spool took nothing" in robot.summary
-    assert "0 chunks kept for later" in robot.summary and "the next start" not in robot.summary
+    assert "nothing waits for the server" in robot.summary and "the next start" not in robot.summary
 
 
 def test_a_robot_that_is_stopped_tries_the_spool_once_more(
@@ -237,7 +237,7 @@ def test_a_robot_that_is_stopped_tries_the_spool_once_more(
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert f"{robot.chunks} chunks kept for later" in robot.summary and "lost" not in robot.summary
+    assert f"{robot.chunks} chunks not yet at the server" in robot.summary and "lost" not in robot.summary
 
 
 def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_memory(
@@ -290,7 +290,7 @@ def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
                 robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert f"{robot.chunks} chunks kept for later" in robot.summary
+    assert f"{robot.chunks} chunks not yet at the server" in robot.summary
 
 
 def test_a_server_that_says_what_is_no_message_does_not_keep_a_robot_from_capturing(
@@ -300,7 +300,7 @@ def test_a_server_that_says_what_is_no_message_does_not_keep_a_robot_from_captur
     noise = Message(b"", b"\xff", robot.client)  # type: ignore[arg-type]
     monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(noise))
     robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
-    assert f"{robot.chunks} chunks kept for later: the server says what is no message" in robot.summary
+    assert f"{robot.chunks} chunks not yet at the server: the server says what is no message" in robot.summary
     assert caplog.text.count("use the same version on both ends") == 1, "once a minute"
 
 
@@ -332,7 +332,7 @@ def test_what_the_source_raises_is_raised_after_what_was_captured_is_kept(make: 
     with pytest.raises(OSError, match="in the middle"):
         robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
     assert robot.captured == 10
-    assert "kept for later" in robot.summary
+    assert "not yet at the server" in robot.summary
 
 
 def test_a_live_source_that_dies_ends_the_robot_at_once_though_no_server_is_there(

@@ -1,4 +1,4 @@
-"""Message definitions, read strictly: what rosbags compiles is only what passed here.
+"""Message definitions: parsed by rosbags, behind limits; what rosbags compiles is only what passed the checks here.
 
 rosbags turns a definition into Python source and executes it, once for the message class and once for each way of
 (de)serialising it; `conversion` does the same. A definition comes from a publisher's connection header, from a bag or
@@ -6,29 +6,31 @@ from a log, that is, from anyone. So what is handed on is a tree that holds noth
 ROS identifiers, built-in type names and bounded integers. Constants and default values never reach it: they are not
 on the wire. They are kept in `text`, which is copied and not interpreted.
 
-Refused besides bad syntax: a type that is missing, contains itself or is nested too deeply (rosbags would recurse), a
+Before rosbags parses a text (MSG: wiki.ros.org/msg; IDL: OMG IDL 4.2, 7.4): comments and blank lines are gone, since
+its time grows with the square of their number; its length, fields and nesting are bounded; and of IDL, annotations,
+expressions and sequences of sequences are gone or refused, on which it takes exponential time, or another type.
+
+Refused after it: a type that is missing, contains itself or is nested too deeply (rosbags would recurse), a
 type that doubles at every level, a fixed array that unrolls into too much code, arrays of elements that take no bytes
 (a count of 2**32 would cost no data), and a definition too long for a line of the log.
-
-The MSG format (wiki.ros.org/msg, "Interfaces" of the ROS 2 documentation) is read here, by a grammar of one line:
-rosbags' parser refuses names that ROS 1 allows. IDL is rewritten in it by `idl`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import keyword
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from itertools import accumulate
+from typing import Literal, TypeAlias
 
 import orjson
 from rosbags.interfaces import Nodetype
-from rosbags.interfaces.typing import Fielddefs, FieldDesc
+from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+from rosbags.typesys.store import Typestore
 
-from rosbridge_eth.capture.idl import idl_as_msg
 from rosbridge_eth.errors import SourceError
 
 Format: TypeAlias = Literal["msg", "idl"]
@@ -57,7 +59,6 @@ _BUILTIN: dict[str, Fielddefs] = {
     name: [("sec", (Nodetype.BASE, ("int32", 0))), ("nanosec", (Nodetype.BASE, ("uint32", 0)))]
     for name in (TIME, DURATION)
 }
-_SHORT_NAMES = {"time": TIME, "duration": DURATION, "Header": HEADER}
 _ROS1_NAMES = {TIME: "time", DURATION: "duration"}
 
 SIZES = {
@@ -75,17 +76,23 @@ _IDENTIFIER = r"[A-Za-z][A-Za-z0-9_]*"
 # A type name becomes a Python name by writing "__" for "/": a "__" of its own would make two names one.
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*_?", re.ASCII)
 _FIELD_NAME = re.compile(_IDENTIFIER, re.ASCII)
-_LINE = re.compile(
-    rf"""
-    (?P<type>{_IDENTIFIER}(?:/{_IDENTIFIER})*)
-    (?:<=(?P<string_bound>[0-9]{{1,10}}))?
-    (?P<array>\[(?P<bounded><=)?(?P<count>[0-9]{{0,10}})\])?
-    [ \t]+
-    (?P<name>{_IDENTIFIER})
-    (?:[ \t]*(?P<constant>=).*|[ \t]*\#.*|[ \t]+[^=].*)?
-    """,
-    re.ASCII | re.VERBOSE,
+_CONSTANT = re.compile(rf"({_IDENTIFIER})[ \t]+({_IDENTIFIER})[ \t]*=", re.ASCII)
+_STRING = r""" "(?:[^"\\\n]|\\.)*+" | '(?:[^'\\\n]|\\.)*+' """
+# Of a file that has several: a line of 80 "=" before each. A comment that does not end goes on to the end of the text.
+_NO_IDL = re.compile(
+    rf"""^={{80}}\r?\n(?:IDL:[^\n]*+)? | //[^\n]*+ | /\*.*?(?:\*/|\Z) | \#[^\n]*+
+       | @\s*+[\w:]++\s*+(?:\((?:{_STRING}|[^"'()])*+\))? | {_STRING}""",
+    re.ASCII | re.DOTALL | re.MULTILINE | re.VERBOSE,
 )
+_UNREAD_CONSTANT = re.compile(r"const [^;=]*=(?! ?[0-9]{1,10} ?;)[^;]*;", re.ASCII)
+MAX_SCOPES = 8
+"""Modules and structs of IDL within each other, and parts of a name there; rosidl has three."""
+_PLAIN_IDL = re.compile(r"[\w\s:;,{}<>=\[\]]*", re.ASCII)
+_BEYOND_IDL = re.compile(rf"<<|sequence ?< ?(?:[\w:]+ ?< ?[^<>]*<|sequence\b)|(?:\w* ?:: ?){{{MAX_SCOPES}}}", re.ASCII)
+_PARSER_ERRORS = (
+    TypesysError, ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
+"""In what rosbags' parsers end on what is no definition."""
 
 
 class DefinitionError(SourceError):
@@ -99,26 +106,24 @@ class Definition:
     fields: of each type name (`pkg/msg/Name`), parts before wholes, in wire order, without constants.
     smallest: bytes the shortest message of each type takes on the wire (ROS 1 form, no padding).
     text: the same in the MSG format with sections: as it was read, without comments, where that was MSG.
+    constants: of each type, those that rosbags reads.
     """
 
     type_name: str
     fields: Mapping[str, Fielddefs]
     smallest: Mapping[str, int]
     text: str
+    constants: Mapping[str, Constdefs]
 
     @cached_property
     def md5(self) -> str:
-        """The sum by which ROS 1 tells definitions apart (wiki.ros.org/ROS/Technical Overview). DefinitionError.
-
-        Of a type: its constants, then its fields, one a line; a field of another message type has that type's sum in
-        place of its name. It says whether two parties mean the same layout, and protects against nobody.
-        """
-        texts = dict(_sections(self.type_name, self.text.splitlines()))
-        sums: dict[str, str] = {}
-        for name in self.fields:  # parts before wholes: nothing recurses
-            if name in texts:
-                sums[name] = _md5_of_one(name, texts[name], sums)
-        return sums[self.type_name]
+        """The sum by which ROS 1 tells definitions apart (wiki.ros.org/ROS/Technical Overview), as rosbags has it."""
+        store = Typestore()
+        store.fielddefs.update({name: (self.constants.get(name, []), list(own)) for name, own in self.fields.items()})
+        try:
+            return store.generate_msgdef(self.type_name)[1]
+        except AssertionError:
+            raise DefinitionError(f"{self.type_name} is of an action or service: ROS 1 has no such messages") from None
 
 
 def normalised_type_name(name: str) -> str:
@@ -141,24 +146,63 @@ def read_definition(type_name: str, text: str, format: Format = "msg") -> Defini
     name = normalised_type_name(type_name)
     if len(text) > MAX_TEXT:
         raise DefinitionError(f"the definition of {name} has {len(text)} characters; at most {MAX_TEXT} are read")
-    sections: Iterable[tuple[str, list[str]]]
-    if format == "idl":
-        try:
-            kept, sections = None, idl_as_msg(text).items()
-        except ValueError as error:
-            raise DefinitionError(f"the IDL definition of {name} cannot be read: {error}") from None
-    else:
-        lines = [stripped for line in text.splitlines() if (stripped := _without_comment(line))]
-        kept, sections = "".join(f"{line}\n" for line in lines), _sections(name, lines)
-    types: dict[str, Fielddefs] = {}
-    for section, lines in sections:
-        fields = [field for line in lines if line != "@key" and (field := _parse_line(section, line))]
-        if types.setdefault(normalised_type_name(section), fields) != fields:
-            raise DefinitionError(f"message type {section} is defined twice, differently")
-    return check_types(name, types, kept)
+    kept = None if format == "idl" else "\n".join(filter(None, map(_without_comment, text.splitlines()))) + "\n"
+    try:
+        types = _idl_types(text) if kept is None else _msg_types(name, kept)
+    except _PARSER_ERRORS as error:
+        why = _shown(str(error).split("\n", 3)[-1])  # of rosbags' lines, the place where it ended
+        raise DefinitionError(f"the definition of {name} cannot be read: {why}") from None
+    if unnamed := [each for each in types if normalised_type_name(each) != each]:
+        raise DefinitionError(f"{_shown(unnamed[0])} is not a message type's full name")
+    fields = {each: own for each, (_, own) in types.items()}
+    return check_types(name, fields, kept, {each: constants for each, (constants, _) in types.items()})
 
 
-def check_types(type_name: str, types: Mapping[str, Fielddefs], text: str | None = None) -> Definition:
+def _msg_types(name: str, text: str) -> Typesdict:
+    """Of each type in the text, which has no blank lines, constants and fields. A constant's value is kept as written:
+    so it counts for `md5`, and rosbags takes fewer forms of it than ROS 1."""
+    _check_length(name, text)
+    constants, fields = dict[str, Constdefs](), dict[str, list[str]]()
+    for section in f"MSG: {name}\n{text}".split(f"{_SEPARATOR}\n"):
+        head, *lines = section.splitlines() or [""]
+        if not head.startswith("MSG:"):
+            raise ValueError(f"behind a separator stands no MSG: pkg/Name but {_shown(head)}")
+        own, found = normalised_type_name(head[4:].strip()), list(map(_CONSTANT.match, lines))
+        kept = [line for line, constant in zip(lines, found, strict=True) if not constant and line != "@key"]
+        if fields.setdefault(own, kept) != kept:
+            raise ValueError(f"message type {own} is defined twice, differently")
+        constants[own] = [(each[2], each[1], each.string[each.end() :].strip()) for each in found if each]  # type: ignore[misc]
+    whole = f"{_SEPARATOR}\n".join("".join(f"{line}\n" for line in [f"MSG: {own}", *fields[own]]) for own in fields)
+    types = get_types_from_msg(whole.partition("\n")[2], name)
+    return {own: (constants[own], parsed) for own, (_, parsed) in zip(fields, types.values(), strict=True)}
+
+
+def _idl_types(text: str) -> Typesdict:
+    plain = _UNREAD_CONSTANT.sub("", " ".join(_NO_IDL.sub(" ", text).split()))
+    scopes = accumulate((char == "{") - (char == "}") for char in plain)
+    if not _PLAIN_IDL.fullmatch(plain) or _BEYOND_IDL.search(plain) or max(scopes, default=0) > MAX_SCOPES:
+        raise ValueError("expressions, nested sequences and deeper scopes of IDL are not supported")
+    if plain.count(";") + plain.count(",") > MAX_FIELDS + MAX_TYPES:
+        raise ValueError(f"it has more than {MAX_FIELDS + MAX_TYPES} declarations")
+    types = get_types_from_idl(plain.replace(">>", "> >"))  # which it takes for a shift
+    if len(types) < len(re.findall(r"\bstruct\b", plain)):
+        raise ValueError("a struct is defined twice")
+    return types
+
+
+def _check_length(name: str, text: str) -> None:
+    try:
+        length = len(orjson.dumps(text))
+    except orjson.JSONEncodeError:
+        raise DefinitionError(f"the definition of {name} is not text") from None
+    if length > MAX_KEPT:
+        raise DefinitionError(f"the definition of {name} is longer than {MAX_KEPT} bytes without its comments")
+
+
+def check_types(
+    type_name: str, types: Mapping[str, Fielddefs], text: str | None = None,
+    constants: Mapping[str, Constdefs] | None = None,
+) -> Definition:  # fmt: skip
     """Check a tree, whoever parsed it, and keep of it what `type_name` refers to. Raises DefinitionError.
 
     text: what it was parsed from; without it, the text is written from the tree.
@@ -173,13 +217,8 @@ def check_types(type_name: str, types: Mapping[str, Fielddefs], text: str | None
     checker = _Checker({**types, **_BUILTIN})
     checker.visit(type_name, 0)
     text = write_text(type_name, checker.done) if text is None else text
-    try:
-        length = len(orjson.dumps(text))
-    except orjson.JSONEncodeError:
-        raise DefinitionError(f"the definition of {type_name} is not text") from None
-    if length > MAX_KEPT:
-        raise DefinitionError(f"the definition of {type_name} is longer than {MAX_KEPT} bytes without its comments")
-    return Definition(type_name, checker.done, checker.smallest, text)
+    _check_length(type_name, text)
+    return Definition(type_name, checker.done, checker.smallest, text, constants or {})
 
 
 class _Checker:
@@ -225,17 +264,22 @@ class _Checker:
         self.done[name], self.smallest[name], self._leaves[name] = fields, size, leaves
         return size
 
+    def _refuse_unsupported(self, where: str, kind: str) -> None:
+        if kind in _UNSUPPORTED:
+            raise DefinitionError(f"{where} is a {kind}, not supported: its wire form differs between middlewares")
+
     def _field(self, where: str, description: FieldDesc, depth: int) -> int:
         if description[0] == Nodetype.BASE:
             name, bound = description[1]
             if not 0 <= bound <= MAX_COUNT:
                 raise DefinitionError(f"{where} has a length out of range: {bound}")
-            if name in _UNSUPPORTED:
-                raise DefinitionError(f"{where} is a {name}, not supported: its wire form differs between middlewares")
+            self._refuse_unsupported(where, name)
             if name not in _BASES:
                 raise DefinitionError(f"{where} has the unknown type {_shown(name)}")
             return SIZES.get(name, 4)
         if description[0] == Nodetype.NAME:
+            if description[1] not in self.types:  # rosbags takes a wstring in MSG for a message type
+                self._refuse_unsupported(where, description[1].rpartition("/")[2])
             return self.visit(description[1], depth + 1)
         element, count = description[1]
         if not 0 <= count <= MAX_COUNT:
@@ -300,71 +344,6 @@ def _without_comment(line: str) -> str:
     if line.startswith("#"):
         return ""
     return line if line.startswith(("string", "wstring")) else line.partition("#")[0].rstrip()
-
-
-def _sections(type_name: str, lines: list[str]) -> Iterator[tuple[str, list[str]]]:
-    """The type names and lines of a definition in the MSG format. Raises DefinitionError."""
-    section: str | None = type_name
-    kept: list[str] = []
-    for line in lines:
-        if line == _SEPARATOR and section is not None:
-            yield section, kept
-            section, kept = None, []
-        elif section is not None:
-            kept.append(line)
-        elif line.startswith("MSG:"):
-            section = normalised_type_name(line[4:].strip())
-        else:
-            raise DefinitionError(f"after a separator, the definition of {type_name} should have MSG: pkg/Name")
-    if section is None:
-        raise DefinitionError(f"the definition of {type_name} ends after a separator")
-    yield section, kept
-
-
-def _parse_line(owner: str, line: str) -> tuple[str, FieldDesc] | None:
-    """One field, or None for a constant."""
-    match = _LINE.fullmatch(line)
-    if match is None:
-        raise DefinitionError(f"a line in the definition of {owner} is not a field: {_shown(line)}")
-    if match["constant"]:
-        return None
-    kind, bound = match["type"], match["string_bound"]
-    if bound and kind not in ("string", "wstring"):
-        raise DefinitionError(f"in the definition of {owner}, only a string has a bound: {_shown(line)}")
-    known = kind in _BASES or kind in _UNSUPPORTED
-    element: Any = (Nodetype.BASE, (kind, int(bound or 0))) if known else (Nodetype.NAME, _full_name(owner, kind))
-    description: Any = element
-    if match["array"]:
-        if match["count"] and not match["bounded"]:
-            description = (Nodetype.ARRAY, (element, int(match["count"])))
-        elif bool(match["count"]) == bool(match["bounded"]):
-            description = (Nodetype.SEQUENCE, (element, int(match["count"] or 0)))
-        else:
-            raise DefinitionError(f"in the definition of {owner}, an array bound has no number: {_shown(line)}")
-    return match["name"], description
-
-
-def _full_name(owner: str, name: str) -> str:
-    if name in _SHORT_NAMES:
-        return _SHORT_NAMES[name]
-    return normalised_type_name(name if "/" in name else f"{owner.rpartition('/')[0]}/{name}")
-
-
-def _md5_of_one(owner: str, lines: list[str], sums: Mapping[str, str]) -> str:
-    constants, fields = [], []
-    for match in map(_LINE.fullmatch, lines):
-        if match is None:
-            raise DefinitionError(f"a line in the definition of {owner} is not a field")
-        kind, name = match["type"], match["name"]
-        if match["constant"]:  # in a string's value, "#" and spaces are part of the value
-            constants.append(f"{kind} {name}={match.string[match.end('constant') :].strip()}")
-        elif kind in _BASES or kind in ("time", "duration"):
-            fields.append(f"{kind}{match['array'] or ''} {name}")
-        elif (inner := sums.get(_full_name(owner, kind))) is not None:
-            fields.append(f"{inner} {name}")
-        else:
-            raise DefinitionError(f"the definition of {owner} refers to {_shown(kind)}, which is not ROS 1's")
-    return hashlib.md5("\n".join([*constants, *fields]).encode(), usedforsecurity=False).hexdigest()
 
 
 def _shown(text: str) -> str:

@@ -127,10 +127,10 @@ def stream_line(source_kind: str, software: str) -> bytes:
     return orjson.dumps({"stream": {"source": source_kind, "software": software}})
 
 
-def parse_line(line: bytes, most: int = MAX_LINE) -> Line:
+def parse_line(line: bytes) -> Line:
     """What a line says, or VerificationError: whoever signed it did not write it by these rules."""
-    if len(line) > most:
-        raise VerificationError(f"a record has {len(line)} bytes; at most {most} are allowed")
+    if len(line) > MAX_LINE:
+        raise VerificationError(f"a record has {len(line)} bytes; at most {MAX_LINE} are allowed")
     if _too_deep(line):
         raise VerificationError(f"a record is nested more than {MAX_DEPTH} deep")
     try:

@@ -20,7 +20,7 @@ from rosbridge_eth.capture.conversion import Conversion
 from rosbridge_eth.capture.lines import definition_line, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
 from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, parse_paths, rule_for
-from rosbridge_eth.chunk import MAX_ARCHIVED_LINE, MAX_LINE
+from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import ConfigError
 
 MAX_CONVERSIONS: Final = 8
@@ -40,14 +40,13 @@ class Cause(StrEnum):
 
 
 class Record(NamedTuple):
-    """A line on its way to the writer. definition: as LogWriter.add takes it; trigger and archive: as in its rule."""
+    """A line on its way to the writer. definition: as LogWriter.add takes it; trigger: as in its rule."""
 
     topic: str
     received_ns: int
     line: bytes
     definition: tuple[str, bytes] | None
     trigger: str | None = None
-    archive: bool = False
 
 
 @dataclass
@@ -107,8 +106,8 @@ class Capture:
             "topic": raw.topic, "type": raw.type_name, "source": self._source_kind,
             "received_ns": raw.received_ns, "captured_ns": wall_ns, "clock": clock_synchronised, "data": data,
         })  # fmt: skip
-        if len(line) > (most := MAX_ARCHIVED_LINE if topic.rule.archive else MAX_LINE):
-            why = f"its fields come to more than {most} bytes of JSON; choose fewer fields"
+        if len(line) > MAX_LINE:
+            why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
             return self._left_out(raw, Cause.RECORD_TOO_LARGE, why)
         if conversion.digested and raw.topic not in self._digested:
             self._digested.add(raw.topic)
@@ -116,7 +115,7 @@ class Capture:
             log.warning(text, raw.topic, conversion.digested, topic.rule.limit)
         topic.schedule.captured(raw.received_ns)
         definition = raw.type_name, definition_line(raw.decoder)
-        return Record(raw.topic, raw.received_ns, line, definition, topic.rule.trigger, topic.rule.archive)
+        return Record(raw.topic, raw.received_ns, line, definition, topic.rule.trigger)
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if the topic's rule does not fit the type."""

@@ -23,8 +23,6 @@ from typing import Final, TypeAlias
 
 DEFAULT_LIMIT: Final = 16 * 1024
 """Bytes of one field from which on its digest stands for it."""
-ARCHIVE_LIMIT: Final = 12_000_000
-"""The same where records are archived: in base64, with other fields, it fits a line."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,6 @@ class TopicRule:
     for_ns: length of the period: from `from_ns`, or from the first message if that is None.
     limit: bytes of a field above which its digest stands for it.
     trigger: records are kept in memory until this event; None: they are written.
-    archive: the records go into chunks for the archive, and may be as long as fits one.
     """
 
     topic: str
@@ -53,7 +50,6 @@ class TopicRule:
     for_ns: int | None = None
     limit: int = DEFAULT_LIMIT
     trigger: str | None = None
-    archive: bool = False
 
 
 class Schedule:
@@ -111,6 +107,9 @@ class Schedule:
             self._end = end if self._end is None else min(end, self._end)
 
 
+MAX_NAME = 255  # characters; https://design.ros2.org/articles/topic_and_service_names.html
+
+
 class NamePattern:
     """A topic's or node's name, or a pattern of names."""
 
@@ -118,6 +117,8 @@ class NamePattern:
         """Raises ValueError with a sentence."""
         self.text = pattern if pattern.startswith(("/", "**")) else f"/{pattern}"
         self.is_exact = not set(pattern) & set("*?[")
+        if len(self.text) > MAX_NAME:
+            raise ValueError(f"{pattern[:40]!r}… has {len(self.text)} characters; ROS 2 allows {MAX_NAME}")
         self._expression = _expression(self.text)
 
     def matches(self, name: str) -> bool:

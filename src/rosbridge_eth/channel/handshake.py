@@ -139,8 +139,8 @@ class ClientHandshake:
             transcript.update(body[offsets[5] : offsets[7]])
             if self._ephemeral is not None:
                 exchange = _exchange(self._identity, peer, self._ephemeral, initiator=True)
-                shared, own = exchange.agree(material, SHARED_SIZE)
-                exchange.confirm(confirmation)
+                _, own = exchange.agree(material, SHARED_SIZE)
+                shared = exchange.confirm(confirmation)
             else:
                 shared, own = self._identity.encryption_key.decrypt(material), NO_CONFIRMATION
         except SMCryptoError as error:
@@ -182,7 +182,7 @@ class ServerHandshake:
             transcript.update(body[offsets[3] :])
             if exchange:
                 self._exchange = _exchange(identity, self.peer, randomness.private_key(), initiator=False)
-                shared, confirmation = self._exchange.agree(point, SHARED_SIZE)
+                shared, confirmation = self._exchange.agree(point, SHARED_SIZE, unconfirmed=True)
                 material = self._exchange.ephemeral
             else:
                 shared, confirmation = randomness.bytes(SHARED_SIZE), b""

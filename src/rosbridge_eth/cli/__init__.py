@@ -10,9 +10,10 @@ import os
 import sqlite3
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from rosbridge_eth import demo, doctor, status, topics
 from rosbridge_eth.cli import operator, reader, robot
@@ -22,8 +23,31 @@ from smcrypto import __version__
 
 INTERRUPTED = 130  # as shells say it of Ctrl-C; typer, too
 
+GROUPS = {
+    "All": ("demo", "status", "doctor", "backup", "passwd"),
+    "Operator": ("up", "init", "chain", "deploy", "register", "server", "revoke", "renew", "reader", "mnemonic",
+                 "handover"),
+    "Robot": ("join", "topics", "robot", "trigger"),
+    "Reader": ("read", "compare", "evidence", "verify", "grant"),
+}
+
+
+class _Grouped(TyperGroup):
+    """Commands by who gives them, in the order in which they are needed; what is in no group comes last."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        named = {name for names in GROUPS.values() for name in names}
+        others = tuple(name for name in self.list_commands(ctx) if name not in named)
+        for title, names in (*GROUPS.items(), ("Other", others)):
+            found = [(name, command) for name in names if (command := self.get_command(ctx, name)) is not None]
+            if found:
+                with formatter.section(title):
+                    formatter.write_dl([(name, command.get_short_help_str(70)) for name, command in found])
+
+
 app = typer.Typer(
     name="rosbridge-eth",
+    cls=_Grouped,
     help="From the name of a ROS topic to a verified record on an Ethereum chain.\n\n"
     "Begin with `demo`; docs/walkthrough.md goes through everything else in ten minutes.",
     no_args_is_help=True,

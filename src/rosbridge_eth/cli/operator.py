@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -14,16 +13,16 @@ import typer
 
 from rosbridge_eth import status, terminal
 from rosbridge_eth.bundle import Request
+from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.values import Address, counted
-from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
+from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
 from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.registry import Registry
 from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
 if TYPE_CHECKING:
@@ -33,8 +32,6 @@ if TYPE_CHECKING:
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
 _ReplaceOption = Annotated[bool, typer.Option("--replace", help="Take a used name over; the old one ends.")]
-_ArchiveOption = Annotated[
-    str | None, typer.Option(help="Where images and clouds rest: a folder, which is made, or s3://BUCKET/PREFIX.")]
 _CompromisedOption = Annotated[
     bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
 
@@ -50,13 +47,11 @@ def add_commands(app: typer.Typer) -> None:
     app.command(name="reader", epilog="Example: rosbridge-eth reader analyst --to analyst")(add_reader)
     app.command(epilog="Example: rosbridge-eth revoke robot_1")(revoke)
     app.command()(renew)
-    app.command(epilog="Example: rosbridge-eth export robot_1 keystore.json")(export)
     app.command()(mnemonic)
     app.command(epilog="Example: rosbridge-eth handover 0x5aAe…; rosbridge-eth handover --home new")(handover)
     app.command(epilog="Example: rosbridge-eth backup copy-of-operator")(backup)
     app.command(epilog="Example: rosbridge-eth passwd --home robot")(passwd)
     app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
-    app.command(epilog="Example: rosbridge-eth check robot_1 0f3a… 17")(check)
 
 
 def passphrase_of(home: OperatorHome, file: Path | None) -> bytes:
@@ -100,9 +95,9 @@ def up(
     home: OperatorHomeOption = OPERATOR_HOME,
     reader: Annotated[Path, typer.Option(help="Folder for the first reader, `owner`.")] = READER_HOME,
     chain: Annotated[str | None, typer.Option(help="A node of yours; without it, an anvil kept in the home.")] = None,
-    listen: Annotated[str | None, typer.Option(help="UDP address of the robots' door: 0.0.0.0:7410.")] = None,
+    listen: Annotated[str | None, typer.Option(help="UDP address on which robots are answered: 0.0.0.0:7410.")] = None,
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
-    archive: _ArchiveOption = None, passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
+    passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
     """Run all of it: an operator's home, chain, contract, server. For trying out and for small sites.
@@ -120,23 +115,20 @@ def up(
         keys = init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
             listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
-            passphrase_file=passphrase_file, archive=archive,
+            passphrase_file=passphrase_file,
         )
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
         place = OperatorHome(home)
     else:
         place, secret, keys = _opened(home, passphrase_file)
         known = load_server_config(place.config)
-        bodies = None if known.archive is None else known.archive.url
-        if archive is not None and "://" not in archive:
-            archive = str(Path(archive).absolute())
         for key, given, now in (
             ("listen", listen, known.listen), ("public", public, known.public), ("[chain] url", chain, known.chain.url),
-            ("[archive] url", archive, bodies),
         ):
             if given not in (None, str(now)):
                 raise ConfigError(f"{place.config} has another address than the option: change {key} there")
-    url, state = load_server_config(place.config).chain.url, home / "chain.json"
+    settings = load_server_config(place.config)
+    url, state = settings.chain.url, home / "chain.json"
     node, deployed = urlsplit(url), place.deployment_file.exists()
     port = node.port if chain is None and node.hostname == "127.0.0.1" and (state.exists() or not deployed) else None
     anvil: Anvil | None = None
@@ -151,9 +143,11 @@ def up(
             anvil.fund(place.account, FUNDS)
             talk(f"A local chain answers at {anvil.url}, kept in {state}.")
         if not deployed:
+            for sock in server_sockets(settings.listen):  # a port that is taken is told before a contract is paid for
+                sock.close()
             made = deploy_contract(place, url, keys)
             if anvil is not None:
-                anvil.save()  # a kill costs some seconds of the chain, and without its contract it could not go on
+                anvil.keeps(made.contract)  # a kill costs some seconds of the chain; without its contract, all of it
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
         where = "" if home == OPERATOR_HOME else f" --home {home}"
         talk("On a robot:    rosbridge-eth join")
@@ -166,12 +160,11 @@ def up(
 def init(
     home: OperatorHomeOption = OPERATOR_HOME,
     reader: Annotated[Path, typer.Option(help="Folder for the first reader, `owner`; carry it away.")] = READER_HOME,
-    listen: Annotated[str, typer.Option(help="UDP address of the robots' door.")] = "0.0.0.0:7410",
+    listen: Annotated[str, typer.Option(help="UDP address on which robots are answered.")] = "0.0.0.0:7410",
     public: Annotated[str | None, typer.Option(help="The address robots are given; by default this machine's.")] = None,
     chain: Annotated[str, typer.Option(help="JSON-RPC URL of a node.")] = "http://127.0.0.1:8545",
     ca: Annotated[Path | None, typer.Option(help="Keep the CA in this folder, or use the one that is there.")] = None,
     mnemonic_file: Annotated[Path | None, typer.Option(help="Restore the accounts from these words.")] = None,
-    archive: _ArchiveOption = None,
     passphrase_file: PassphraseFile = None, ca_passphrase_file: _CaPassphraseFile = None,
     reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
@@ -188,7 +181,7 @@ def init(
     words = mnemonic_file and read_passphrase("mnemonic", "Mnemonic", file=mnemonic_file).decode()
     keys = init_home(
         place, passphrase, reader=ReaderHome(reader), reader_passphrase=readers, now=utc_now(), listen=listen,
-        public=public, chain_url=chain, ca=ca, archive=archive,
+        public=public, chain_url=chain, ca=ca,
         ca_passphrase=read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file)
         if ca_passphrase_file else None,
         keys=Keyring.from_mnemonic(words) if words else None,
@@ -267,6 +260,7 @@ def register(
         talk(f"It was given no ETH yet ({made.unfunded}); nothing is written for it until the server can give it some.")
     if made.buried:
         talk(f"Dead letters now: {counted(made.buried, 'chunk')} of the old {name}; `status` lists them.")
+    talk(f"It seals for these readers: {', '.join(made.readers)}.")
     talk(f"The CA is {grouped(ca.certificate.fingerprint().hex())}.")
     if request is None:
         talk(f"Carry {made.bundle} to the robot and run there: rosbridge-eth join {made.bundle.name}")
@@ -331,30 +325,6 @@ def renew(
     ca = _ca(place, passphrase, ca_passphrase_file)
     old = renew_server(place, ca=ca, passphrase=passphrase, now=utc_now())
     talk(f"The server has new keys; those before are in {old}. Start the server again; robots need nothing.")
-
-
-def export(
-    name: Annotated[str, typer.Argument(help="A robot's name, or `operator`.")],
-    file: Annotated[Path, typer.Argument(help="The keystore to write.")],
-    home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
-    password_file: Annotated[Path | None, typer.Option(help="The keystore's own password.")] = None,
-) -> None:  # fmt: skip
-    """Write an account as a keystore, for other Ethereum software."""
-    from rosbridge_eth.administration import OPERATOR
-
-    (place, _, keys), number = _opened(home, passphrase_file), 0
-    if name != OPERATOR:
-        with Registry(place.registry) as registry:
-            robot = registry.find(Role.ROBOT, name)
-        if robot is None:
-            raise IdentityError(f"no robot {name!r} has an account; `status` lists the names")
-        number = robot.number
-    password = read_passphrase("keystore", "Password of the keystore", file=password_file, confirm=True)
-    try:
-        write_atomically(file, jsonlib.dumps(keys.export(number, password)).encode() + b"\n", mode=0o600, new=True)
-    except FileExistsError:
-        raise ConfigError(f"{file} exists; choose another name") from None
-    talk(f"{file} holds the account {keys.account(number).address}.")
 
 
 def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
@@ -439,23 +409,3 @@ def _serve(
             look()
 
         Supervisor(place, config, secrets, workers).run(ready, on_look)
-
-
-def check(
-    robot: Annotated[str, typer.Argument(help="The robot's name.")],
-    stream: Annotated[str, typer.Argument(help="The chunk's stream: 32 hex digits, as `read` shows it.")],
-    number: Annotated[int, typer.Argument(min=0, help="The chunk's number in the stream.")],
-    home: OperatorHomeOption = OPERATOR_HOME, json: terminal.Json = False,
-) -> None:  # fmt: skip
-    """Say where a chunk is. Asks the inbox and the chain, and of one in a block the contract itself (checkData)."""
-    place = OperatorHome(home).require()
-    with ledger_of(place) as ledger:
-        found = status.locate(place, ledger, robot, stream, number)
-    if json:
-        terminal.print_json(found._asdict())
-    else:
-        where = f" in block {found.block}, transaction {found.transaction}" if found.block is not None else ""
-        said = "" if found.proven is None else f"; the contract says {str(found.proven).lower()}"
-        typer.echo(f"{found.state}{where}{said}")
-    if found.state in ("unknown", "dead letter") or found.proven is False:
-        raise VerificationError(f"chunk {number} of stream {stream} of {robot} is not where it should be")

@@ -3,6 +3,7 @@ reader hands to others, and how they check it."""
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import threading
@@ -46,10 +47,14 @@ def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
 
 
+DAY_NS = 86_400 * 10**9
+
 RobotName: TypeAlias = Annotated[str, typer.Argument(help="The robot's name.")]
 Topic: TypeAlias = Annotated[str | None, typer.Option(help="Only this topic.")]
-From: TypeAlias = Annotated[str | None, typer.Option("--from", help="Only what was received from this time on.")]
-To: TypeAlias = Annotated[str | None, typer.Option(help="Only what was received before this time.")]
+From: TypeAlias = Annotated[str | None, typer.Option(
+    "--from", help="Only what was received from this time on; a date begins at midnight, UTC.")]
+To: TypeAlias = Annotated[str | None, typer.Option(
+    help="Only what was received before this time; with a date, to the end of that day.")]
 At: TypeAlias = Annotated[str | None, typer.Option(help="Only the last record of each topic up to this moment.")]
 Nodes: TypeAlias = Annotated[list[str] | None, typer.Option(
     "--node", help="Ask these nodes, not those of reader.toml.")]
@@ -59,15 +64,18 @@ Confirm: TypeAlias = Annotated[bool, typer.Option(
     "--confirm", help="The fingerprints of new certificates are compared and right.")]
 
 
-def _time(text: str | None) -> int | None:
+def _time(text: str | None, *, end: bool = False) -> int | None:
+    """A time; a date is its first moment in UTC, or with `end` the first one after it."""
     try:
+        if text is not None and re.fullmatch(r"\d{4}-\d\d-\d\d", text, re.ASCII):
+            return parse_time(f"{text}T00:00:00Z") + DAY_NS * end
         return None if text is None else parse_time(text)
     except ValueError as error:
-        raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z") from error
+        raise typer.BadParameter(f"{text!r}: write a time such as 2026-11-21T10:00:00Z, or a date") from error
 
 
 def _choice_of(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
-    choice = Choice(topic, _time(from_), _time(to), _time(at))
+    choice = Choice(topic, _time(from_), _time(to, end=True), _time(at))
     if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
         raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
     if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
@@ -96,11 +104,11 @@ def read(
     node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Give what a robot wrote, proven, from the chain. As JSON lines, bag, table or plot.
+    """Print what a robot wrote, verified, from the chain. As JSON lines, bag, table or plot.
 
     What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
-    sealed for others. With --follow, .mcap and .csv files grow; others are there at the end.
+    sealed for others. With --follow, an .mcap file grows; others are there at the end.
     """
     from rosbridge_eth.reading import outputs
 
@@ -142,9 +150,7 @@ def read(
         if made is not None and follow:
             turns.append(made.flush)
         if table is not None:
-            rows = files.enter_context(outputs.table(table, grows=follow))
-            sinks.append(rows.write)
-            turns.append(rows.flush)
+            sinks.append(files.enter_context(outputs.table(table)).write)
         if plot is not None:
             sinks.append(picture.write)
         if not sinks and not json and address is None:
@@ -179,7 +185,7 @@ def compare(
     node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Hold a recording of your own against what the chain has. Message by message, field by field.
+    """Compare a recording of your own with what the chain has. Message by message, field by field.
 
     Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
     """
@@ -198,7 +204,7 @@ def compare(
         talk(f"and {made.wrong - len(made.differences):,} differences more")
     if made.absent:
         talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
-    talk(f"{made.equal:,} records are equal to the bag's; {made.wrong:,} differences")
+    talk(f"equal to the bag's: {counted(made.equal, 'record')}; {counted(made.wrong, 'difference')}")
     _require_sound(place, robot, said)
     if made.wrong or not made.equal:
         raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
@@ -240,33 +246,32 @@ def evidence(
 def verify(
     file: Annotated[Path, typer.Argument(help="What `evidence` wrote, JSON or page.")],
     ca: Annotated[Path, typer.Option(help="The CA's certificate (PEM): from the operator, not from who has the file.")],
-    node: Annotated[str | None, typer.Option(help="Ask this node whether the blocks are its chain's.")] = None,
+    node: Annotated[str | None, typer.Option(help="Ask this node whether the contract has it.")] = None,
     json: Json = False,
 ) -> None:
     """Check evidence, and say what it proves. What it shows goes to stdout as JSON lines; no node is needed.
 
     Exits with 9 where anything does not hold, with 7 where the node named does not answer.
     """
-    from rosbridge_eth.ledger.transport import shown as shown_url
     from rosbridge_eth.reading import evidence as checking
 
     data = read_given(file, checking.MAX_FILE + 1)
     given = checking.Evidence.read(data)
-    found = checking.verify(given, read_certificates(read_given(ca)), lambda line: talk(f"holds: {line}"))
-    if node is not None:
-        checking.ask(found, node)
-        node = shown_url(node)
-        talk(f"holds: all {len(found.blocks)} blocks are those of the chain, says {node}")
+    roots = read_certificates(read_given(ca))
+    found = checking.verify(given, roots, lambda line: talk(f"holds: {line}"))
+    asked = None if node is None else checking.ask(given, found, roots, node)
+    if asked is not None:
+        talk(f"holds: the contract has {counted(len(given.chunks), 'chunk')} as the file says, says {asked.node}")
     if json:
         print_json(found.as_json())
     else:
         for record in found.records:
             print(record.json_line(), end="")
     talk("What this proves:")
-    for line in found.proves():
+    for line in found.proves(asked):
         talk(f"- {line}")
     talk("What it does not prove:")
-    for line in found.proves_not("" if node is None else node):
+    for line in found.proves_not(asked):
         talk(f"- {line}")
     if data.strip().decode() not in (given.encode(), given.page().strip()):
         talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
@@ -329,7 +334,6 @@ class _Asked(NamedTuple):
 def _asking(
     place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
 ) -> Iterator[_Asked]:
-    from rosbridge_eth.archive import open_archive
     from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.reading.grant import open_folder
 
@@ -338,13 +342,12 @@ def _asking(
     trust = Trust(roots)
     ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
     bookmarks = Bookmarks(place.path / "bookmarks.json")
-    bodies = None if config.archive is None else open_archive(config.archive).get
     granted = open_folder(place.grants, ledger=config.ledger, reader=identity, trust=trust)
 
     def read(robot: str, **more: Any) -> Reading:
         return read_robot(
             ledgers, robot, trust=trust, reader=identity.encryption_key, bookmarks=bookmarks,
-            granted=granted.get(robot), cache=place.path / "proven", confirmations=confirmations, bodies=bodies, **more,
+            granted=granted.get(robot), memo=place.path / "proven", confirmations=confirmations, **more,
         )  # fmt: skip
 
     with ExitStack() as stack:

@@ -22,16 +22,16 @@ from rich.text import Text
 from rosbridge_eth import bundle as bundles
 from rosbridge_eth import terminal
 from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
-from rosbridge_eth.config.models import BagConfig
+from rosbridge_eth.config.models import BagConfig, SimConfig
 from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.home import RobotHome, require_empty
 from rosbridge_eth.identity import check_name
-from rosbridge_eth.logs import LogFormat, log_to_stderr
-from rosbridge_eth.passphrases import read_passphrase
+from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
+from rosbridge_eth.passphrases import read_passphrase, warn_if_others_read
 from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.sources import Offer
-from rosbridge_eth.terminal import errors, live, table, talk
-from rosbridge_eth.topics import ANYTHING, SourceOption, everything, offered, robot_toml
+from rosbridge_eth.terminal import errors, live, plain, table, talk
+from rosbridge_eth.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
 
 if TYPE_CHECKING:
     from rosbridge_eth.metrics import Rates
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
-PLUMBING = {"/rosout", "/rosout_agg", "/parameter_events", "/clock"}
 """Topics of ROS itself; they are taken only where they are named."""
 TAKEN_WITHIN = 10.0  # seconds for a running robot to see what `trigger` asks for; it looks once a second
 
@@ -95,9 +94,12 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
         asked = "Messages come from (ros1, ros2, sim, a ROS 1 master's URI, or a bag)"
         source = str(typer.prompt(asked, default=found, err=True)) if asks else found
     config = parse_config(RobotConfig, robot_toml(topics or ["**"], source), place.config)
-    if not topics or isinstance(config.source, BagConfig):  # a bag is there already, or it is a slip of the pen
+    if not topics or isinstance(config.source, BagConfig | SimConfig):  # which will not offer more
         with closing(everything(config)) as opened:
-            offers = [] if topics else offered(opened)
+            offers = offered(opened)
+        if topics and not opened.live:
+            config.selection().resolve_all(offers, str(source))
+            offers = []
         topics = topics or sorted({offer.topic for offer in offers} - PLUMBING)
         if asks and offers:
             topics = _choose(offers, topics)
@@ -138,8 +140,9 @@ def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> No
     talk(f"{place.path} is now the home of {opened.end.robot}. Name its topics in {place.config}, then run `robot`.")
 
 
-def _say_who(fingerprint: str) -> None:
-    talk(f"The operator's CA is {grouped(fingerprint)}; compare it with what `register` showed.")
+def _say_who(joined: bundles.Joined) -> None:
+    talk(f"The operator's CA is {grouped(joined.ca)}; compare it with what `register` showed.")
+    talk(f"It says that these may read what this robot writes: {', '.join(joined.readers) or 'nobody'}.")
 
 
 def robot(
@@ -157,12 +160,13 @@ def robot(
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
-    if fingerprint := bundles.take_up(place):
-        _say_who(fingerprint)
+    if joined := bundles.take_up(place):
+        _say_who(joined)
     end = place.bridge()
     settings = load_robot_config(place.config)
     source, why = settings.source_and_why(os.environ)
     talk(f"Messages come from {SOURCES[source.kind]} ({why}).")
+    warn_if_others_read(*sorted(place.identity.glob("*.key.pem")))
     password = read_passphrase("robot", f"Password of {end.robot}", file=password_file)
     again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
@@ -273,11 +277,11 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
     columns = ["topic", "records/s", "records", "sealed", "waiting", "confirmed", "lost"]
     return Group(
         table(name, columns, rows, right=range(1, 7)),
-        *map(Text, kept),
+        *map(plain, kept),
         Text(
             f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
             f" {spool.chunks - spool.unstored - spool.aside} for the chain, {sender.confirmed} confirmed{where}."
-            f" Session: {session}.",
+            f" Session: {one_line(session)}.",
             no_wrap=False, overflow="fold",  # why there is no session is longer than a line
         ),
     )

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from pydantic import (  # isort: skip
-    AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, ValidationInfo, WithJsonSchema,
+    AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, WithJsonSchema,
 )  # fmt: skip
 from pydantic import model_validator as validator
 
 from rosbridge_eth.blackbox import Condition, TriggerRule
 from rosbridge_eth.capture import NamePattern, TopicRule
-from rosbridge_eth.capture.rules import ARCHIVE_LIMIT, parse_paths
+from rosbridge_eth.capture.rules import parse_paths
 from rosbridge_eth.chunk import MAX_READERS
-from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size, to_path
+from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.home import ledger_of
 
@@ -88,7 +88,6 @@ Pattern = Annotated[str, AfterValidator(_pattern)]
 FieldPath = Annotated[str, AfterValidator(_field_path)]
 Speed = Annotated[float | None, BeforeValidator(_speed), WithJsonSchema({"type": 'number or `"max"`'})]
 Mode = Literal["exchange", "transport"]
-Store = Literal["chain", "archive"]
 Name = Annotated[str, _matching(
     r"[a-z0-9][a-z0-9_.\-]{0,62}", "a name has 1 to 63 of a-z, 0-9, _ . - and begins with a letter or digit")]
 MasterUri = Annotated[str, _matching(
@@ -106,41 +105,8 @@ NodeUrl = Annotated[str, _matching(
     'a node\'s URL; write "http://127.0.0.1:8545" or "https://..."', secret=True)]
 StoreUrl = Annotated[str, _matching(
     r"sqlite|rediss?://\S+|unix://\S+", 'a store; write "sqlite" or "redis://127.0.0.1:6379/0"', secret=True)]
-_S3_URL = re.compile(r"s3://[a-z0-9][a-z0-9.\-]{1,61}[a-z0-9](?:/[\w.\-/]*)?", re.ASCII)
-
-
-def _archive_url(value: Any, info: ValidationInfo) -> str | Path:
-    if not isinstance(value, str) or "://" not in value:
-        return to_path(value, info)
-    if not _S3_URL.fullmatch(value):
-        raise ValueError('is no archive; write a folder, "s3://BUCKET" or "s3://BUCKET/PREFIX"; keys stand elsewhere')
-    return value
-
-
-ArchiveUrl = Annotated[str | Path, BeforeValidator(_archive_url), WithJsonSchema({"type": "folder or S3 URL"})]
 ContractAddress = Annotated[str, _matching("0x[0-9a-fA-F]{40}", "an address is 0x and 40 hexadecimal digits")]
 Hash = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexadecimal digits")]
-
-
-class ArchiveConfig(Section):
-    """The archive: where the bodies of archived chunks rest (docs/howto-archive.md). Without it there is none.
-
-    url: A folder, or `"s3://BUCKET/PREFIX"`.
-
-    endpoint: URL of the store, where that is not Amazon's; without it, `AWS_ENDPOINT_URL` of the environment.
-
-    region: The bucket's region; without it, `AWS_REGION` of the environment.
-
-    keys: A file with the access key id and the secret access key, which only its owner may read; without it, those of
-    the environment (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`), or of the machine's role.
-    """
-
-    url: ArchiveUrl
-    endpoint: Annotated[str, _matching(
-        rf"https?://{_HOST}{_PORT}/?", 'write a URL without keys, such as "https://s3.example.org:9000"',
-        secret=True)] | None = None
-    region: str | None = None
-    keys: FilePath | None = None
 
 
 # The robot
@@ -167,8 +133,6 @@ class TopicConfig(Section):
     for: Length of the period, from `from` or from the first message.
 
     trigger: The name of a `[[trigger]]`: records are kept in memory and go into the log only when that happens.
-
-    store: Where its records go, as in `[capture]`; without it, where that says.
     """
 
     topic: Pattern
@@ -180,7 +144,6 @@ class TopicConfig(Section):
     until: TimeNs | None = None
     for_: DurationNs | None = Field(default=None, alias="for")
     trigger: Name | None = None
-    store: Store | None = None
 
     @validator(mode="after")
     def _consistent(self) -> TopicConfig:
@@ -224,15 +187,11 @@ class TriggerConfig(Section):
 class CaptureConfig(Section):
     """What holds for every topic.
 
-    field_limit: Largest field that is captured as it is, 12 MB of what goes into the archive; of a larger one its SM3
-    digest and length are captured, which the log says once per topic.
-
-    store: Where records go: onto the chain, or into the operator's archive, with header and signature of their chunks
-    on the chain (docs/howto-archive.md). That is for images and point clouds.
+    field_limit: Largest field that is captured as it is; of a larger one its SM3 digest and length are captured, which
+    the log says once per topic.
     """
 
     field_limit: Annotated[int, size(high="48 KiB")] = 16 * KIB
-    store: Store = "chain"
 
 
 class BagConfig(Section):
@@ -263,8 +222,8 @@ class Ros1Config(Section):
     node: The name under which the robot appears in the graph; without it, one of its own for each process,
     `/rosbridge_eth_MACHINE_PID`.
 
-    max_message: A larger message is not read, but counted. Messages that wait or are arriving take at most four times
-    as much memory.
+    max_message: A larger message is not read, but counted. Messages that wait take at most twice as much memory,
+    and one may be arriving from each publisher.
     """
 
     kind: Literal["ros1"]
@@ -394,8 +353,6 @@ class RobotConfig(Section):
     def _consistent(self) -> RobotConfig:
         if not self.topics and not self.nodes:
             raise ValueError('names nothing to watch; write topics = ["/robot_1/odom"] or nodes = ["/robot_1/base"]')
-        if self.spool.max_size < 64 * MIB and any(rule.archive for rule in self.rules()):
-            raise ValueError('has a topic with store = "archive": [spool] max_size should be at least "64 MiB"')
         names = [topic.topic for topic in self.topics]
         if twice := [name for number, name in enumerate(names) if name in names[:number]]:
             raise ValueError(f"names topic {twice[0]} twice")
@@ -432,10 +389,9 @@ class RobotConfig(Section):
         return [
             TopicRule(
                 topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
-                topic.for_, ARCHIVE_LIMIT if archive else self.capture.field_limit, topic.trigger, archive,
+                topic.for_, self.capture.field_limit, topic.trigger,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
-            for archive in [(topic.store or self.capture.store) == "archive"]
         ]
 
     def source_and_why(self, environment: Mapping[str, str]) -> tuple[AnySource, str]:
@@ -521,19 +477,19 @@ class FundsConfig(Section):
 
     by: By so much ETH. The contract refuses above 5 ETH.
 
-    gas_per_day: Gas that one robot may use in 24 hours; what is above it waits. The default is enough for about 100
-    records a second.
+    gas_per_day: Gas that one robot may use in 24 hours, and at once that of one; what is above it waits. The default
+    is enough for about 40 records a second; `topics` says what a robot's take.
     """
 
     below: float = Field(default=0.05, ge=1e-6, lt=5)
     by: float = Field(default=0.5, ge=1e-6, le=5)
-    gas_per_day: int = Field(default=30_000_000_000, ge=1_000_000)
+    gas_per_day: int = Field(default=10_000_000_000, ge=1_000_000)
 
 
 class ServerConfig(Section):
     """The server's configuration, `server.toml`.
 
-    listen: UDP address of the robots' door.
+    listen: UDP address on which robots are answered.
 
     public: The address that robots are given in their bundles; without it, `listen`.
 
@@ -553,8 +509,6 @@ class ServerConfig(Section):
 
     store: The inbox (below).
 
-    archive: Where the bodies of archived chunks rest (below).
-
     funds: Robots' accounts (below).
     """
 
@@ -567,13 +521,12 @@ class ServerConfig(Section):
     passphrase_file: FilePath | None = None
     chain: ChainConfig = ChainConfig()
     store: StoreConfig = StoreConfig()
-    archive: ArchiveConfig | None = None
     funds: FundsConfig = FundsConfig()
 
     def address_for_robots(self) -> Address:
         """`public`, or `listen`; ConfigError where that is no address that a robot could send to."""
         address = self.public or self.listen
-        if address.port == 0 or address.host in ("0.0.0.0", "::"):  # noqa: S104 - that is what is refused
+        if address.nowhere:
             raise ConfigError(
                 f"robots would be told to send to {address}, which is no machine's address: write into server.toml"
                 ' public = "HOST:PORT", as robots reach the server'
@@ -593,10 +546,8 @@ class ReaderConfig(Section):
 
     genesis: The hash of the chain's first block, which every signature covers, too.
 
-    chain: JSON-RPC URL of a node of the chain, or a list of them: all are asked, the highest count holds, and where
-    they disagree it is told.
-
-    archive: Where the bodies of archived chunks are (below).
+    chain: JSON-RPC URL of a node of the chain, or a list of them: what they say of a robot is compared, and where they
+    disagree the log is not sound.
     """
 
     contract: ContractAddress
@@ -605,7 +556,6 @@ class ReaderConfig(Section):
     chain: Annotated[list[NodeUrl], BeforeValidator(_listed)] = Field(
         default=["http://127.0.0.1:8545"], min_length=1, repr=False
     )
-    archive: ArchiveConfig | None = None
 
     @property
     def ledger(self) -> bytes:

@@ -16,6 +16,7 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -82,6 +83,16 @@ class Address(NamedTuple):
 
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def nowhere(self) -> bool:
+        """Whether nothing can be sent there: port 0, or any address (0.0.0.0 or ::, in whatever form)."""
+        try:
+            if ":" in self.host:
+                return self.port == 0 or int(ip_address(self.host)) in (0, 0xFFFF << 32)
+            return self.port == 0 or socket.inet_aton(self.host) == bytes(4)  # of "0" and "0x0", too
+        except (OSError, ValueError):  # a name
+            return False
 
     @property
     def family(self) -> socket.AddressFamily:

@@ -37,8 +37,14 @@ CREATE INDEX IF NOT EXISTS chunk_by_number ON chunk (tk, stream, number);
 CREATE TABLE IF NOT EXISTS head (
     tk BLOB, stream BLOB, number BLOB, digest BLOB, PRIMARY KEY (tk, stream)
 ) WITHOUT ROWID;
+-- How often each process that appends has done so: fewer than it knows of, and an old copy was put back meanwhile.
+CREATE TABLE IF NOT EXISTS writer (no INTEGER PRIMARY KEY, id BLOB UNIQUE NOT NULL, commits INTEGER NOT NULL);
 CREATE TABLE IF NOT EXISTS dead (no INTEGER PRIMARY KEY AUTOINCREMENT, tk BLOB, why TEXT, taken_at REAL, chunk BLOB);
 """
+_WRITERS: Final = 1000  # that are kept; the oldest go
+_COMMITTED: Final = (
+    "INSERT INTO writer (id, commits) VALUES (?, ?) ON CONFLICT DO UPDATE SET commits = excluded.commits"
+)
 _NEXT: Final = "UPDATE robot SET next = next + 1 WHERE tk = ? AND bytes <= ? RETURNING next"
 _BURY: Final = "INSERT INTO dead SELECT NULL, tk, ?, taken_at, chunk FROM chunk WHERE tk = ? AND position = ?"
 
@@ -54,6 +60,7 @@ class SqliteInbox(Inbox):
         self._open()
 
     def _open(self) -> None:
+        self._writer, self._commits = secrets.token_bytes(8), 0
         self._db = Database(
             self._path, "inbox", application=_APPLICATION, schema=_SCHEMA, wal_pages=1000, read_only=self._read_only
         )
@@ -61,6 +68,8 @@ class SqliteInbox(Inbox):
             if not self._read_only:
                 make = "INSERT INTO inbox SELECT ?, ? WHERE NOT EXISTS (SELECT 1 FROM inbox)"
                 self._db.write(lambda: self._db.run(make, (secrets.token_bytes(16), self._ledger)))
+                many = "DELETE FROM writer WHERE no <= (SELECT max(no) FROM writer) - ?"
+                self._db.write(lambda: self._db.run(many, (_WRITERS,)), durable=False)
             rows = self._read("SELECT id, ledger FROM inbox")
             if not rows:
                 raise NothingThere(f"there is no inbox {self._path} yet")
@@ -82,14 +91,31 @@ class SqliteInbox(Inbox):
             return self._db.run(statement, values).fetchall()
 
     def append(self, chunks: Sequence[tuple[bytes, Chunk]], now: float) -> list[Outcome]:
-        if self._db.replaced():
+        hashed = [(tk, chunk, keccak(chunk.encoded)) for tk, chunk in chunks]
+        try:
+            if self._db.replaced():
+                raise InboxExchanged(f"the inbox {self._path} was exchanged or removed while it was in use")
+            if not chunks:
+                self._require_commits()
+                return []
+            outcomes = self._db.write(lambda: self._append(hashed, now))
+        except InboxExchanged:
             self.close()
             self._open()
-            raise InboxExchanged(f"the inbox {self._path} was exchanged or removed while it was in use")
-        hashed = [(tk, chunk, keccak(chunk.encoded)) for tk, chunk in chunks]
-        return self._db.write(lambda: self._append(hashed, now)) if chunks else []
+            raise
+        self._commits += 1
+        return outcomes
+
+    def _require_commits(self) -> None:
+        """InboxExchanged unless all is there that this object has committed: SQLite's own backup can put an old copy
+        into the file while it is in use, and what was acknowledged since is to be sent again."""
+        rows = self._read("SELECT commits FROM writer WHERE id = ?", self._writer)
+        if (rows[0][0] if rows else 0) != self._commits:
+            raise InboxExchanged(f"an old copy of the inbox {self._path} was put back while it was in use")
 
     def _append(self, chunks: Sequence[tuple[bytes, Chunk, bytes]], now: float) -> list[Outcome]:
+        self._require_commits()
+        self._db.run(_COMMITTED, (self._writer, self._commits + 1))
         outcomes: list[Outcome] = []
         full: set[bytes] = set()
         (room,) = self._db.one("SELECT ? - coalesce(sum(bytes), 0) FROM robot", (self.max_bytes,))

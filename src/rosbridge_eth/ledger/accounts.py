@@ -13,7 +13,7 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_file, seal_box, write_atomically
@@ -90,14 +90,6 @@ class Keyring:
         if number < 1:
             raise IdentityError("robots' accounts count from 1; number 0 is the operator's")
         return self.account(number)
-
-    def export(self, number: int, passphrase: bytes) -> dict[str, Any]:
-        """One account as a keystore (Web3 Secret Storage, version 3) that any client imports."""
-        from eth_account import Account
-
-        password = passphrase.decode("utf-8", "surrogateescape")
-        exported: dict[str, Any] = Account.encrypt(self.account(number).key, password)
-        return exported
 
     # ------------------------------------------------------------------ at rest
 

@@ -35,6 +35,9 @@ GAS_A_BYTE = 40
 NOTHING = bytes(32)  # the tail of a robot that wrote no chunk
 PAGE = 500  # robots in one `standings`
 SPAN = 2_000  # blocks asked for at once; what public nodes usually allow
+MAX_BLOCK = 2**32  # no chain has as many blocks; at four a second they take 34 years
+MAX_REGISTRATIONS = 1_000  # of one robot
+MAX_CERTIFICATES = 16 * 2**20  # bytes in all of them
 RECEIPT_LATE = 5.0  # seconds that a node may know an account's nonce before it has the transaction's receipt
 SENT_AT_ONCE = 4  # of 200 kB in hex at most; nginx takes 1 MB where nobody said otherwise, anvil 2, geth 5
 _Event = TypeVar("_Event")
@@ -251,8 +254,8 @@ class Ledger:
             got: Any = self._w3.eth.get_block(number)  # type: ignore[arg-type]
             fee = got.get("baseFeePerGas")
             found = Block(
-                natural(got["number"]), natural(got["timestamp"]), bytes32(got["hash"]), natural(got["gasLimit"]),
-                None if fee is None else natural(fee, 2**128),
+                natural(got["number"], MAX_BLOCK), natural(got["timestamp"]), bytes32(got["hash"]),
+                natural(got["gasLimit"]), None if fee is None else natural(fee, 2**128),
             )  # fmt: skip
             if number not in ("latest", found.number):
                 raise ValueError(f"block {found.number} in place of block {number}")
@@ -260,7 +263,7 @@ class Ledger:
 
     def block_number(self) -> int:
         with self._node.asking():
-            return natural(self._w3.eth.block_number)
+            return natural(self._w3.eth.block_number, MAX_BLOCK)
 
     def block_time(self, number: int) -> int:
         """UTC seconds."""
@@ -295,13 +298,14 @@ class Ledger:
     # ------------------------------------------------------------------ what the contract says
 
     def standings(self, tks: Sequence[bytes], block: int | str = "latest") -> list[Standing]:
-        """How these robots stand, as of a block; in the order asked."""
+        """How these robots stand, as of a block; in the order asked. They name no block above it."""
+        end = block + 1 if isinstance(block, int) else MAX_BLOCK
         found: list[Standing] = []
         for start in range(0, len(tks), PAGE):
             page = tks[start : start + PAGE]
             answer = self._read("standings", list(page), block=block)
             with self._node.asking():
-                rows = [_standing(row) for row in answer]
+                rows = [_standing(row, end) for row in answer]
                 if len(rows) != len(page):
                     raise ValueError(f"{len(rows)} standings for {len(page)} robots")
             found += rows
@@ -332,8 +336,11 @@ class Ledger:
     # ------------------------------------------------------------------ events
 
     def data_events(self, tk: bytes, first_block: int, last_block: int) -> Iterator[DataEvent]:
-        """The robot's batches in these blocks, oldest first; asked for in ranges, halved where they are refused."""
-        span, start = SPAN, first_block
+        """The robot's batches in these blocks, oldest first; asked for in ranges, halved where they are refused.
+
+        Ranges double while they are empty: blocks without batches, of which a node may show 2**32, cost little.
+        """
+        span, start, most = SPAN, first_block, MAX_BLOCK
         while start <= last_block:
             end = min(start + span - 1, last_block)
             try:
@@ -342,9 +349,10 @@ class Ledger:
                 if span == 1:
                     raise
                 span //= 2
+                most = max(span, SPAN)
                 continue
             yield from found
-            start, span = end + 1, min(2 * span, SPAN)
+            start, span = end + 1, min(2 * span, SPAN if found else most)
 
     def newest_data(self, tk: bytes, last_block: int) -> Iterator[DataEvent]:
         """The robot's batches from `last_block` back, newest first, by their links; `last_block` holds one.
@@ -368,14 +376,21 @@ class Ledger:
             block, span = oldest.previous_block, min(2 * span, most)
 
     def registrations(self, tk: bytes, standing: Standing) -> list[RegistrationEvent]:
-        """All of the robot's registrations and revocations up to `standing`, oldest first, by their links."""
+        """All of the robot's registrations and revocations up to `standing`, oldest first, by their links.
+
+        ChainError where a link leads nowhere or not back, and above MAX_REGISTRATIONS or MAX_CERTIFICATES.
+        """
         found: list[RegistrationEvent] = []
+        size = 0
         block = standing.changed_block
         while block > 0:
             page = self._events({"Registered": _registration, "Revoked": _registration}, tk, block, block)
             if not page or page[0].previous_block >= block:
                 raise ChainError(f"{self.url} has no registration of this robot in block {block}, where one must be")
             found = page + found
+            size += sum(len(event.certificates) for event in page)
+            if len(found) > MAX_REGISTRATIONS or size > MAX_CERTIFICATES:
+                raise ChainError(f"{self.url} shows more than {MAX_REGISTRATIONS:,} registrations of this robot")
             block = page[0].previous_block
         return found
 
@@ -514,11 +529,11 @@ class Ledger:
 # ---------------------------------------------------------------------- forms of answers
 
 
-def _standing(row: Any) -> Standing:
+def _standing(row: Any, end: int) -> Standing:
     account, certificates_hash, revoked, chunks, tail, balance, data_block, changed_block = row
     return Standing(
         account if int(account, 16) else None, certificates_hash, revoked, natural(chunks), tail, balance,
-        natural(data_block), natural(changed_block),
+        natural(data_block, end), natural(changed_block, end),
     )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import gzip
 import json
 import logging
 import os
@@ -22,8 +21,7 @@ from web3 import HTTPProvider
 from web3.middleware import combine_middleware
 from web3.providers.eth_tester import EthereumTesterProvider
 
-from rosbridge_eth.errors import BridgeError, ChainError
-from rosbridge_eth.files import write_atomically
+from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger.transport import limit_recursion, session
 
 log = logging.getLogger(__name__)
@@ -79,11 +77,9 @@ class EmbeddedChain(EthereumTesterProvider):
 VERSION = "1.7.1"
 START_SECONDS = 60.0  # the first start downloads it
 STOP_SECONDS = 10.0
-SAVE_SECONDS = 5.0  # between two looks whether there is something to save
-SAVE_SHARE = 20  # of the time at most so little is spent on saving
+STATE_SECONDS = 5  # between two times that anvil writes its state
 _WITH_US = 'exec 3<&0; { read -r _ <&3; kill -KILL 0; } & exec "$@" </dev/null 3<&-'
 """Runs a program until its input, a pipe that nobody writes to, is closed; then all of its group is killed."""
-TOLD_FROM = 256 * 2**20  # bytes of state that are worth a warning, and every doubling of it
 
 
 def is_free(port: int) -> bool:
@@ -105,23 +101,17 @@ def free_port(first: int) -> int:
 class Anvil:
     """A running anvil at `url`. Made by `start`; ends with `stop` or the `with` block.
 
-    Where it has a state file, the chain survives. anvil itself would write the file in place, again and again; here it
-    is asked for its state and the file exchanged for a new one, so that what is there is whole at every moment.
-    A kill costs what came since the last time: 5 s, or twenty times as long as writing takes. It ends with the process
-    that started it, also if that one is killed: nobody would save what it has.
+    Where it has a state file, the chain survives: anvil writes it every STATE_SECONDS and at its end. A kill costs what
+    came since, and in the middle of writing may cost the file: use geth for a chain that is to stay. It ends with the
+    process that started it, also if that one is killed.
     """
 
     def __init__(self, port: int, process: subprocess.Popen[bytes], state: Path | None) -> None:
         self.url = f"http://127.0.0.1:{port}"
-        self.state_size = 0  # bytes, when it was last written
         self._process, self._state = process, state
         self._provider = HTTPProvider(
             self.url, {"timeout": 120.0}, session(limit=2**32), exception_retry_configuration=None
         )
-        self._saved = ""
-        self._told = TOLD_FROM
-        self._stopped = threading.Event()
-        self._saver = threading.Thread(target=self._save_often, daemon=True)
 
     @staticmethod
     def start(
@@ -144,8 +134,9 @@ class Anvil:
                 " them, or use a node of yours (`up --chain URL`, or [chain] url in server.toml)"
             )
         command += ["--host", "127.0.0.1", "--port", str(port), *options]
-        if state is not None and state.exists():
-            command += ["--load-state", str(state)]
+        if state is not None:
+            command += ["--state", str(state), "--state-interval", str(STATE_SECONDS)]
+            command += ["--timestamp", str(_begun(state))]
         if block_time is not None:
             command += ["--block-time", f"{block_time:g}"]
         process = subprocess.Popen(  # noqa: S603 - fixed programs
@@ -168,8 +159,7 @@ class Anvil:
                     + (f"; it may be that {state} is damaged" if state and state.exists() else "")
                 ) from error
         if state is not None:
-            anvil.save()
-            anvil._saver.start()
+            anvil.ask("evm_setTime", hex(int(time.time())))  # it goes on from that of its first block
         return anvil
 
     def fund(self, account: str, eth: int) -> None:
@@ -196,51 +186,37 @@ class Anvil:
         """Block until it ends; its exit code."""
         return self._process.wait()
 
-    def save(self) -> None:
-        """Write the state file, if there is something new. ChainError."""
-        head = self.ask("eth_getBlockByNumber", "latest", False)["hash"]
-        if self._state is None or head == self._saved:
-            return
-        state = json.loads(gzip.decompress(bytes.fromhex(self.ask("anvil_dumpState")[2:])))
-        content = json.dumps(_trimmed(state)).encode()
-        try:
-            write_atomically(self._state, content)
-        except OSError as error:
-            raise ChainError(f"{self._state} cannot be written: {error.strerror}") from error
-        self._saved, self.state_size = head, len(content)
-        while self.state_size >= self._told:
-            log.warning(
-                "the chain's state takes %d MB, is written anew at every save and grows with every record; "
-                "use geth for a chain that is to stay", self.state_size // 10**6,
-            )  # fmt: skip
-            self._told *= 2
-
-    def _save_often(self) -> None:
-        pause = SAVE_SECONDS
-        while not self._stopped.wait(pause):
-            began = time.monotonic()
-            try:
-                self.save()
-            except BridgeError as error:
-                if self.running():
-                    log.error("the chain's state is not saved: %s", error)
-            pause = max(SAVE_SECONDS, SAVE_SHARE * (time.monotonic() - began))
+    def keeps(self, account: str) -> None:
+        """Wait until the state file has this account. ChainError."""
+        deadline = time.monotonic() + START_SECONDS
+        while self._state and not (
+            self._state.exists() and account[2:].lower() in self._state.read_text("utf-8").lower()
+        ):
+            if not self.running() or time.monotonic() > deadline:
+                raise ChainError(f"anvil does not write {self._state}; is there room on the disk?")
+            time.sleep(0.1)
 
     def stop(self) -> None:
-        """Save the state, let it end; kill it if it does not. ChainError where the last of it could not be saved."""
-        try:
-            if self._saver.is_alive():
-                self._stopped.set()
-                self._saver.join()
-                if self.running():
-                    self.save()
-        finally:
-            self._end(signal.SIGINT)
+        """Let it write its state and end; kill it if it does not."""
+        self._end(signal.SIGINT)
 
     def kill(self) -> None:
         """As a power cut would."""
-        self._stopped.set()
         self._end(signal.SIGKILL)
+
+    def _wait_for_the_rest(self, deadline: float) -> None:
+        """npx ends before the anvil that it started, which still writes its state; the shell that watches us stays."""
+        while time.monotonic() < deadline:
+            names = set[str]()
+            for file in Path("/proc").glob("[0-9]*/stat"):
+                with suppress(OSError):  # it has ended
+                    name, _, rest = file.read_text().rpartition(")")
+                    state, _, group = rest.split()[:3]
+                    if int(group) == self._process.pid and state != "Z":
+                        names.add(name.partition("(")[2])
+            if names <= {"sh"}:
+                return
+            time.sleep(0.02)
 
     def _end(self, number: signal.Signals) -> None:
         with suppress(ProcessLookupError, subprocess.TimeoutExpired):
@@ -248,6 +224,7 @@ class Anvil:
                 # npx starts anvil as a child of its own: the signal goes to the group that start() made.
                 os.killpg(self._process.pid, number)
                 self._process.wait(STOP_SECONDS)
+                self._wait_for_the_rest(time.monotonic() + STOP_SECONDS)
         if self._process.stdin is not None:
             self._process.stdin.close()  # and what is left of the group is killed
         self._process.wait()
@@ -259,15 +236,13 @@ class Anvil:
         self.stop()
 
 
-def _trimmed(state: dict[str, Any]) -> dict[str, Any]:
-    """A state without what nobody asks for: traces, which are half of it, and first blocks that are not the chain's.
+def _begun(state: Path) -> int:
+    """When the chain began, in seconds since 1970: now, if there is none.
 
-    A restarted anvil makes a first block of its own before it reads the file, and later gives both; the start after
-    that takes either, and so may come back as another chain. Each is as old as its start: the oldest is the chain's.
+    anvil makes a first block at every start and then has both, its own and the file's; with this time they are one.
     """
-    for transaction in state["transactions"]:
-        transaction["info"]["traces"] = []
-    first = [block for block in state["blocks"] if int(block["header"]["number"], 16) == 0]
-    oldest = min(first, key=lambda block: int(block["header"]["timestamp"], 16))
-    state["blocks"] = [block for block in state["blocks"] if block is oldest or block not in first]
-    return state
+    try:
+        heads = [block["header"] for block in json.loads(state.read_bytes())["blocks"]]
+        return min(int(head["timestamp"], 16) for head in heads if int(head["number"], 16) == 0)
+    except (OSError, ValueError, LookupError, TypeError):  # one that is damaged is told by anvil
+        return int(time.time())

@@ -49,6 +49,7 @@ TOP_UPS = 20  # sent together; the next ones when all of them are in blocks
 WALK = 50  # batches read back for one robot in one turn
 ROWS = IN_FLIGHT * BATCH_BYTES // 203  # no chunk is smaller than 203 bytes
 MINUTE, DAY = 60.0, 86_400.0
+BURST = 3600.0  # seconds of a robot's gas that it may use at once
 ALL = bytes(16)
 """No robot has this stream: a head for it says that the inbox knows the head of every stream on the chain."""
 
@@ -61,7 +62,7 @@ class Settings:
     max_fee: int = 500 * 10**9
     low_water: int = contract.WEI_PER_ETH // 20
     top_up: int = contract.WEI_PER_ETH // 2
-    gas_per_day: int = 30_000_000_000
+    gas_per_day: int = 10_000_000_000
 
 
 class Batch(NamedTuple):
@@ -173,7 +174,7 @@ class Submitter:
         self._confirm(standings, head, now)
         work = []
         for tk, standing in standings.items():
-            account = self._known.setdefault(tk, Account(gas=self._settings.gas_per_day / 10, gas_at=now))
+            account = self._known.setdefault(tk, Account(gas=self._settings.gas_per_day * BURST / DAY, gas_at=now))
             try:
                 after = self._place(tk, account, standing, now)
                 if rows := self._inbox.rows(tk, after, 1):
@@ -391,13 +392,13 @@ class Submitter:
             raise _Hold(str(error)) from error
 
     def _affords(self, account: Account, gas: int, now: float) -> bool:
-        """Take the gas from what the robot may use. gas_per_day flows in, a day's at most is kept; a tenth of it is
-        there after a start, so that restarts hardly add to what a robot can spend.
+        """Take the gas from what the robot may use. gas_per_day flows in; an hour's at most is kept, and there after a
+        start: so much a robot gone mad, or who stole its key, can spend at once.
         """
-        daily = self._settings.gas_per_day
-        account.gas = min(daily, account.gas + max(0.0, now - account.gas_at) * daily / DAY)
+        a_second = self._settings.gas_per_day / DAY
+        account.gas = min(BURST * a_second, account.gas + max(0.0, now - account.gas_at) * a_second)
         account.gas_at = now
-        if account.gas < min(gas, daily):  # a batch above a day's gas takes that of the days after it, too
+        if account.gas < min(gas, BURST * a_second):  # a batch above an hour's gas takes that of the hours after it
             return False
         account.gas -= gas
         return True

@@ -4,6 +4,11 @@ The recording is a bag that this robot replayed, or that was recorded beside it.
 topic, so a record that is missing, doubled or out of its place is a difference. A record of a replay has the bag's
 receive time; one of a live robot was received by it and by the recorder at times of their own, so there it is the
 content that says which message it is, among those of a SLACK around. Memory holds the messages of twice that.
+
+The bag need not span the whole log. Up to a SLACK outside its first and last message, a record may have a message in it
+and need not. Where contents repeat, those before the first message are counted back from the first record inside. The
+clocks of a live robot and of the recorder differ: up to a SLACK inside, too, a record need not have a message if it is
+before the one of the topic's first message, or after that of its last.
 """
 
 from __future__ import annotations
@@ -20,7 +25,7 @@ import numpy
 
 from rosbridge_eth.capture import MessageLine, RawMessage
 from rosbridge_eth.capture.definitions import attribute_name
-from rosbridge_eth.config.values import time_text
+from rosbridge_eth.config.values import counted, time_text
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.reading.verify import Choice
 from rosbridge_eth.sources import BagSource, Selection
@@ -51,7 +56,8 @@ class Comparison:
 def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *, some: bool = False) -> Comparison:
     """Hold each record on the topics against the bag's own message: each captured field equal, and none missing.
 
-    Records that were received before the bag begins or after it ends are not looked at.
+    Records that were received a SLACK before the bag begins or after it ends are not looked at; nearer to its ends, one
+    without a message is no difference, unless it is the record before it once more.
     topics: none for all of the bag's; one of these without a single record is `absent`, and no difference.
     some: the robot captured only some of the messages, by a rate or period; those that it did not are no difference.
     """
@@ -59,6 +65,10 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
     made, messages = Comparison(), source.messages()
     waiting: dict[str, deque[RawMessage]] = {topic: deque() for topic in source.decoders()}
     unmet = dict.fromkeys(waiting, 0)  # of the topics that had no record yet, messages that should have had one
+    early: dict[str, list[MessageLine]] = {topic: [] for topic in waiting}  # until the first record inside the bag
+    unlike: dict[str, list[tuple[int, str]]] = {topic: [] for topic in waiting}  # before the first that is like one
+    live: dict[str, bool] = {}  # of topics of which a record was like a message: received at another time than that
+    previous: dict[str, MessageLine] = {}
 
     def missing(raw: RawMessage) -> None:
         if raw.topic in unmet:
@@ -66,29 +76,64 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
         elif not some:
             made.differ(raw.topic, raw.received_ns, "the chain has no record of this message")
 
+    def judge(record: MessageLine) -> None:
+        topic, time, mine = record.topic, record.received_ns, waiting[record.topic]
+        before, wrong = _message_of(record, mine)
+        here = bool(mine) and (wrong is None or any(raw.received_ns == time for raw in mine))
+        if not here and not first <= time <= last:
+            return
+        if not here and topic in unlike and time < first + SLACK:
+            unlike[topic].append((time, wrong or ""))
+            return
+        if not here and not mine and live.get(topic) and time > last - SLACK:
+            return
+        if wrong is None:
+            live[topic] = mine[before].received_ns != time
+        if not live.get(topic) or before or unmet.get(topic):
+            for at_ns, why in unlike.get(topic, ()):
+                made.differ(topic, at_ns, why)
+        unlike.pop(topic, None)
+        for _ in range(before):
+            missing(mine.popleft())
+        if here:
+            mine.popleft()
+        if (count := unmet.pop(topic, 0)) and not some:
+            made.differ(topic, time, f"the chain has no record of {counted(count, 'message')} before this one")
+        if wrong is None:
+            made.equal += 1
+        else:
+            made.differ(topic, time, wrong)
+
     try:
         (first, last), ahead = source.span, next(messages, None)
         for record in (record for record in records if record.topic in waiting):
-            topic, time, mine = record.topic, record.received_ns, waiting[record.topic]
+            topic, time = record.topic, record.received_ns
             if not first - SLACK <= time <= last + SLACK:
                 continue
             while ahead is not None and ahead.received_ns <= time + SLACK:
                 waiting[ahead.topic].append(ahead)
                 ahead = next(messages, None)
+            twin, previous[topic] = previous.get(topic), record
+            if (
+                twin and (twin.received_ns, twin.data) == (time, record.data)
+                and not any(raw.received_ns == time for raw in waiting[topic])
+            ):  # fmt: skip
+                made.differ(topic, time, "the bag has no such message; it is the record before it once more")
+                continue
+            if time < first and topic in early:
+                early[topic].append(record)
+                continue
+            for one in _with_message(early.pop(topic, []), record, waiting[topic]):
+                judge(one)
             for old in waiting.values():
                 while old and old[0].received_ns < time - SLACK:
                     missing(old.popleft())
-            before, wrong = _message_of(record, mine)
-            for _ in range(before):
-                missing(mine.popleft())
-            if mine and (wrong is None or mine[0].received_ns == time):
-                mine.popleft()
-            if (count := unmet.pop(topic, 0)) and not some:
-                made.differ(topic, time, f"the chain has no record of the {count:,} messages before this one")
-            if wrong is None:
-                made.equal += 1
-            else:
-                made.differ(topic, time, wrong)
+            judge(record)
+        for record in (record for rest in early.values() for record in rest):
+            judge(record)
+        for topic, held in unlike.items():
+            for at_ns, why in held:
+                made.differ(topic, at_ns, why)
         for rest in (*waiting.values(), [] if ahead is None else [ahead], messages):
             for raw in rest:
                 missing(raw)
@@ -96,7 +141,7 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
         source.close()
     for topic, count in unmet.items():
         if topics and count:
-            made.differ(topic, first, f"the chain has no record of any of the {count:,} messages on this topic")
+            made.differ(topic, first, f"the chain has no record of any of this topic's messages; the bag has {count:,}")
         else:
             made.absent.append(shown(topic))
     return made
@@ -108,6 +153,19 @@ def time_of(bag: Path) -> Choice:
     source.close()
     first, last = source.span
     return Choice(from_ns=first - SLACK, to_ns=last + SLACK + 1)
+
+
+def _with_message(
+    early: list[MessageLine], record: MessageLine, waiting: Sequence[RawMessage]
+) -> list[MessageLine]:
+    """Those of the records before the bag's begin that can have a message before that of the first record inside."""
+    if not early:  # of all records but a topic's first: nothing is to be decoded for them
+        return early
+    same = [at for at, raw in enumerate(waiting) if _wrong(record.data, raw.decoder.decode(raw.raw), "") is None]
+    if not same:
+        return early
+    count = min(same, key=lambda at: abs(waiting[at].received_ns - record.received_ns))
+    return early[-count:] if count else []
 
 
 def _message_of(record: MessageLine, waiting: Sequence[RawMessage]) -> tuple[int, str | None]:

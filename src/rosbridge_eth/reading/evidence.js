@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Checks the evidence of a robot's records, as docs/evidence.md says it, with nothing but the language: SM3, keccak-256,
-// SM2 signatures, X.509 (RFC 5280, as far as a robot's certificates go), RLP and Merkle-Patricia tries. It is written
+// SM2 signatures and X.509 (RFC 5280, as far as a robot's certificates go). It is written
 // from that page and docs/log.md, not from the Python; tests hold both against each other and against the standards.
 //
 // evidence.verify(text, told) gives what the file shows, or throws a Wrong that says what does not hold.
@@ -252,6 +252,7 @@ const evidence = (() => {
     need(!Number.isNaN(time), 'a certificate has a time that is none')
     return time
   }
+  const HARMLESS = new Set(['551d0e', '551d20', '551d23']) // identifiers of keys, and policies: any is taken
   const bits = (part) => {
     need(part?.tag === 0x03 && part.content.length > 0, 'a certificate is not in the form of one')
     return part.content.subarray(1)
@@ -275,177 +276,47 @@ const evidence = (() => {
     const isOne = ({ tag, content }) => tag === 2 && content[0] < 0x80 && (content[0] > 0 || !(content[1] < 0x80))
     need(numbers.length === 2 && numbers.every(isOne), 'a certificate is not DER')
     const [r, s] = numbers.map(({ content }) => big(content))
-    Object.assign(found, { r, s, authority: false, usage: null, purposes: [], names: [] })
+    Object.assign(found, { r, s, authority: false, usage: null, purposes: null, names: [] })
     const extensions = rest.find(({ tag }) => tag === 0xa3)
+    const there = new Set()
     for (const extension of extensions ? within(one(extensions.content), 0x30) : []) {
       const parts = within(extension, 0x30)
       const id = hex(parts[0].content)
+      need(!there.has(id) && there.add(id), 'a certificate has an extension twice')
       const value = parts.at(-1).content
       if (id === '551d13') found.authority = within(one(value), 0x30).some(({ tag, content }) => tag === 1 && content[0])
       else if (id === '551d0f') found.usage = bits(one(value))[0] // digitalSignature 80 ... keyAgreement 08, keyCertSign 04
       else if (id === '551d25') found.purposes = within(one(value), 0x30).map(({ content }) => hex(content))
       else if (id === '551d11') {
         found.names = within(one(value), 0x30).map(({ tag, content }) => [tag & 0x1f, String.fromCharCode(...content)])
-      } else need(parts.length === 2 || !parts[1].content[0], `a certificate has a critical extension, ${id}`)
+      } else if (!HARMLESS.has(id)) need(parts.length === 2 || !parts[1].content[0], `a certificate has a critical extension, ${id}`)
     }
+    found.constrained = there.has('551d1e') // nameConstraints
     return found
   }
 
-  // The robot's signing certificate in a registration, if the CA signed both for this robot and they had not ended then.
-  // A certificate that begins later than its block is a chain whose clock is behind.
-  function signer(certificates, roots, robot, blockTime) {
+  // The robot's signing certificate of a registration, if the CA signed both for this robot; judged by when they begin.
+  // What has to hold is the table of docs/log.md (Certificates).
+  const ROBOT = '2b06010505070302' // clientAuth
+  function signer(certificates, roots, robot) {
     const first = element(certificates).whole
     const pair = [certificate(first), certificate(certificates.subarray(first.length))]
-    const at = Math.max(blockTime * 1000, ...pair.map(({ from }) => from))
+    const at = Math.max(...pair.map(({ from }) => from))
     pair.forEach((made, n) => {
       const name = `6,urn:rosbridge-eth:robot:${robot}`
       need(made.names.length === 1 && String(made.names[0]) === name, `a certificate is not for ${robot}`)
       const issued = (root) =>
-        root.subject === made.issuer && root.authority && (root.usage === null || root.usage & 0x04) &&
+        root.subject === made.issuer && root.authority && !root.constrained && (root.usage === null || root.usage & 0x04) &&
+        (root.purposes === null || root.purposes.some((use) => [ROBOT, '551d2500'].includes(use))) &&
         root.from <= at && at <= root.until && signed(root.key, made.tbs, made.r, made.s)
       need(roots.some(issued), 'the CA did not sign a certificate')
-      need(made.from <= at && at <= made.until, 'a certificate had ended when it was registered')
+      need(made.from <= at && at <= made.until, 'a certificate ends before the other begins')
       const [own, others] = n ? [0x08, 0x80] : [0x80, 0x38]
       need(made.usage & own && !(made.usage & others), 'a certificate is for another use')
-      need(made.purposes.includes('2b06010505070302'), 'a certificate is for another purpose')
+      need(made.purposes?.includes(ROBOT), 'a certificate is for another purpose')
+      need(!made.authority, "a certificate is a CA's")
     })
     return { key: pair[0].key, fingerprint: hex(sm3(first)), until: Math.min(pair[0].until, pair[1].until) }
-  }
-
-  // ---------------------------------------------------------------- RLP and tries, Ethereum's yellow paper, B and D
-
-  // A string is its bytes; a list is { list: its encoding }, which `items` takes apart, one level at a time.
-  function extent(data, at) {
-    need(at < data.length, 'an RLP item ends early')
-    const first = data[at]
-    if (first < 0x80) return [false, at, at + 1]
-    let size = first & 0x3f
-    let start = at + 1
-    if (size >= 56) {
-      start += size - 55
-      const length = data.subarray(at + 1, start)
-      need(length[0] !== 0, 'an RLP length is not in its one form')
-      size = small(length, 'an RLP length')
-      need(size >= 56, 'an RLP length is not in its one form')
-    } else need(first !== 0x81 || data[start] >= 0x80, 'an RLP string is not in its one form')
-    need(start + size <= data.length, 'an RLP item ends early')
-    return [first >= 0xc0, start, start + size]
-  }
-  function items(data, most = Infinity) {
-    let [isList, at, end] = extent(data, 0)
-    need(isList && end === data.length, 'what should be an RLP list is none')
-    const found = []
-    while (at < end) {
-      const [list, start, stop] = extent(data, at)
-      need(found.length < most, 'an RLP list has too many items')
-      found.push(list ? { list: data.subarray(at, stop) } : data.subarray(start, stop))
-      at = stop
-    }
-    need(at === end, 'what should be an RLP list is none')
-    return found
-  }
-  // The items of a list of this form: s is a string, l a list.
-  const partsOf = (data, form, what) => {
-    const found = items(data ?? [], form.length)
-    need(found.map((one) => (one.list ? 'l' : 's')).join('') === form, `${what} is not in the form of one`)
-    return found.map((one) => one.list ?? one)
-  }
-  const rlpIndex = (n) => {
-    const bytes = n ? word(n, Math.ceil(n.toString(16).length / 2)) : new Uint8Array(0)
-    return bytes.length === 1 && bytes[0] < 0x80 ? bytes : join([0x80 + bytes.length], bytes)
-  }
-
-  class Nodes {
-    constructor(list) {
-      this.byHash = new Map(list.map((node) => [hex(keccak(node)), node]))
-      this.used = new Set()
-      this.leaves = new Set()
-      need(this.byHash.size === list.length, 'a node of a trie is there twice')
-    }
-
-    // As many steps as the key has nibbles, through nodes of a branch's size; and no leaf twice.
-    get(root, key, what) {
-      const missing = `the trie does not have ${what}`
-      let path = hex(key)
-      let [name, node] = this.at(root, what)
-      for (;;) {
-        const parts = items(node, 17)
-        let [leaf, shared, child] = [false, path[0]]
-        if (parts.length === 17 && path) child = parts[parseInt(shared, 16)]
-        else {
-          need(parts.length === 2 && parts[0].length, missing)
-          const prefix = hex(parts[0])
-          const flag = parseInt(prefix[0], 16)
-          need(flag <= 3 && (flag & 1 || prefix[1] === '0'), missing)
-          ;[leaf, shared, child] = [flag & 2, prefix.slice(flag & 1 ? 1 : 2), parts[1]]
-        }
-        need(path.startsWith(shared), missing)
-        path = path.slice(shared.length)
-        if (leaf) {
-          need(!path && !child.list, missing)
-          need(!this.leaves.has(name), `the proof of ${what} has the leaf of another`)
-          if (name) this.leaves.add(name)
-          return child
-        }
-        need(shared && node.length <= 3 + 17 * 33, missing)
-        ;[name, node] = child.list?.length < 32 ? ['', child.list] : this.at(child.list ?? child, what)
-      }
-    }
-
-    at(hash, what) {
-      const name = hex(hash)
-      need(this.byHash.has(name), `the proof of ${what} does not hold: a node of its trie is missing`)
-      this.used.add(name)
-      return [name, this.byHash.get(name)]
-    }
-  }
-
-  // ---------------------------------------------------------------- the contract RobotLedger
-
-  const CODE = 'd06d5cfc15aef121b4bf5a5aabe51d006fb9f820dc919102b3e4b135ff697e5c'
-  const topic = (text) => hex(keccak(utf8.encode(text)))
-  const DATA = topic('Data(bytes32,uint256,address,uint256,bytes[])')
-  const REGISTERED = topic('Registered(bytes32,address,uint256,uint256,bytes)')
-  const REVOKED = topic('Revoked(bytes32,address,uint256,uint256)')
-
-  function* eventsOf(receipt, contract, tk, block) {
-    const [status, , , logs] = partsOf(receipt[0] < 0x80 ? receipt.subarray(1) : receipt, 'sssl', 'a receipt')
-    need(hex(status) === '01', 'a receipt is of a transaction that failed')
-    for (const log of items(logs)) {
-      const [address, topics, data] = partsOf(log.list, 'sls', 'a log')
-      if (!same(address, contract)) continue
-      const named = items(topics, 4)
-      need(named.every((one) => one.length === 32), 'an event has a topic that is none')
-      const [kind, robot, first] = named.map(hex)
-      if (robot !== hex(tk) || ![DATA, REGISTERED, REVOKED].includes(kind)) continue
-      const number = (at) => {
-        need(at + 32 <= data.length, 'an event ends early')
-        return small(data.subarray(at, at + 32), 'a number in an event')
-      }
-      const blob = (at) => {
-        const end = at + 32 + number(at)
-        need(end <= data.length, 'an event ends early')
-        return data.subarray(at + 32, end)
-      }
-      const asWritten = (holds) => need(holds, 'an event of the contract is not as Solidity writes it')
-      asWritten(named.length === (kind === DATA ? 4 : 3))
-      const [zeroth, previous] = [number(0), number(32)]
-      if (kind === DATA) {
-        asWritten(previous === 64)
-        const [count, chunks] = [number(64), []]
-        let place = 32 * count
-        for (let n = 0; n < count; n++) {
-          asWritten(number(96 + 32 * n) === place)
-          chunks.push(blob(96 + place))
-          place += 32 + Math.ceil(chunks[n].length / 32) * 32
-        }
-        yield { data: true, first: small(unhex(first), 'the number of a chunk'), chunks, block }
-      } else if (kind === REVOKED) yield { index: zeroth, previous, revoked: true, block }
-      else {
-        asWritten(number(64) === 96)
-        yield { index: zeroth, previous, certificates: blob(96), block }
-      }
-    }
   }
 
   // ---------------------------------------------------------------- the chunk, docs/log.md
@@ -454,18 +325,17 @@ const evidence = (() => {
     const count = data[138]
     const end = 139 + count * 121
     const form = (holds) => need(holds, 'a chunk is not in the form of one')
-    form(data.length >= end + 64 && data[0] === 2 && data[1] <= 3 && count >= 1 && count <= 16)
+    form(data.length >= end + 64 && data[0] === 2 && data[1] <= 1 && count >= 1 && count <= 16)
     const header = data.subarray(0, end)
     const field = (at, size) => header.subarray(at, at + size)
     const rest = data.length - end - 64
     const length = small(field(102, 4))
-    form(length % 64 === 16 && length > 16 && length < (data[1] & 2 ? 2 ** 24 : 2 ** 16) && (rest === 0 || rest === length))
+    form(length % 64 === 16 && length > 16 && length < 2 ** 16 && (rest === 0 || rest === length))
     form(small(field(66, 4)) >= 1 && small(field(66, 4)) <= 1000 && big(field(58, 8)) < 253402300800000n)
     return {
       encoded: header, digest: hex(sm3(header)), stream: hex(field(2, 16)), number: String(big(field(18, 8))),
       sealed: small(field(58, 8), 'when a chunk was sealed'), records: small(field(66, 4)), root: field(70, 32),
       r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0,
-      archived: (data[1] & 2) !== 0, longest: data[1] & 2 ? 2 ** 24 - 2 ** 17 : 60 * 1024, // bytes of a line
     }
   }
 
@@ -491,9 +361,9 @@ const evidence = (() => {
   const TOKEN = new RegExp(`${STRING}|[-+.\\w]+|[^]`, 'g')
   const MESSAGE = new RegExp(`^\\{"topic":${STRING},"type":${STRING},"source":${STRING},` +
     '"received_ns":(-?\\d+),"captured_ns":(-?\\d+),"clock":(?:true|false),"data":\\{')
-  function parsed(line, most) {
+  function parsed(line) {
     const form = (holds) => need(holds, 'it is not in the one form of a record')
-    form(utf8.encode(line).length <= most)
+    form(utf8.encode(line).length <= 60 * 1024)
     const [message, ...times] = MESSAGE.exec(line) ?? []
     need(message && times.every((time) => BigInt(time) >= 0n && BigInt(time) < 2n ** 63n), 'it is no captured message')
     const [tokens, open] = [line.match(TOKEN), []] // open: of each level, an object's names, or null for an array
@@ -534,20 +404,27 @@ const evidence = (() => {
     } catch {
       throw new Wrong('this is no evidence: it is not JSON')
     }
-    members(file, 'format,robot,chain_id,genesis,contract,authorities,records,blocks,nodes', 'the file')
-    need(file.format === 'rosbridge-eth evidence 1', 'this is evidence of another format')
+    members(file, 'format,robot,chain_id,genesis,contract,authorities,certificates,chunks,records', 'the file')
+    need(file.format === 'rosbridge-eth evidence 2', 'this is evidence of another format')
     const escaped = (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0')
     need(JSON.stringify(file).replace(/[<\u007f-\uffff]/g, escaped) === text.trim(), 'the file is not in its one form')
     need(typeof file.robot === 'string' && /^[a-z0-9][a-z0-9_.-]{0,62}$/.test(file.robot), 'no robot has such a name')
     need(isCount(file.chain_id), 'the chain has no such id')
-    for (const block of list(file.blocks, 'the blocks')) members(block, 'hash,header,receipts', 'a block')
+    for (const chunk of list(file.chunks, 'the chunks')) {
+      members(chunk, 'chunk,certificate,encoded,first,hashes,block,transaction', 'a chunk')
+      const { chunk: at, certificate, first, block } = chunk
+      need([at, certificate, first, block].every(isCount), 'a chunk has no place')
+      need(list(chunk.hashes, 'the hashes of a batch').length <= 1e5, 'there is too much in the file')
+      unhex(chunk.transaction, 32, 'a transaction')
+    }
     for (const record of list(file.records, 'the records')) {
       members(record, 'chunk,record,line,salt,path', 'a record')
       need(isCount(record.chunk) && isCount(record.record) && record.record < 1000, 'a record has no place')
       need(typeof record.line === 'string' && !/\p{Cs}/u.test(record.line), 'a record has no line, or half a character in it')
     }
-    need(file.records.length > 0 && file.blocks.length > 0, 'there is nothing in the file')
-    need(file.records.length <= 1e5 && list(file.authorities, 'the CAs').length <= 16, 'there is too much in the file')
+    need(file.records.length > 0 && file.chunks.length > 0, 'there is nothing in the file')
+    const most = file.records.length <= 1e5 && list(file.authorities, 'the CAs').length <= 16
+    need(most && list(file.certificates, 'the certificates').length <= 1000, 'there is too much in the file')
     return file
   }
 
@@ -560,110 +437,52 @@ const evidence = (() => {
     const authorities = file.authorities.map((one) => unhex(one, undefined, "a CA's certificate"))
     told('the file is whole and in its one form')
 
-    // blocks and events
-    const nodes = new Nodes(list(file.nodes, 'the nodes').map((node) => unhex(node, undefined, 'a node')))
-    const events = []
-    const blocks = file.blocks.map((block) => {
-      const encoded = unhex(block.header, undefined, 'a header')
-      const fields = items(encoded, 21)
-      need(fields.length >= 15 && fields.every((one) => !one.list), "a block's header is not in the form of one")
-      const [state, receipts, number, time] = [3, 5, 8, 11].map((n) => fields[n])
-      need(same(unhex(block.hash, 32, "a block's hash"), keccak(encoded)), "a block's header does not have its hash")
-      const [at, when] = [small(number, "a block's number"), small(time, "a block's time")]
-      return { number: at, time: when, state, receipts, hash: block.hash, shows: block.receipts }
-    })
-    const last = blocks.at(-1)
-    need(ascending(blocks.map(({ number }) => number)), 'the blocks are not in order')
-    for (const block of blocks) {
-      const inOrder = list(block.shows, 'the receipts').every(isCount) && ascending(block.shows)
-      need(inOrder && (block.shows.length || block === last), `block ${block.number} shows no receipts, or not in order`)
-      for (const index of block.shows) {
-        const what = `receipt ${index} of block ${block.number}`
-        const found = [...eventsOf(nodes.get(block.receipts, rlpIndex(index), what), contract, tk, block)]
-        need(found.length, `${what} has no event of ${robot}`)
-        events.push(...found)
-      }
-    }
-    told(`the contract's events are in these blocks, by the receipts under their receiptsRoot`)
-
-    // the contract's storage
-    const account = partsOf(nodes.get(last.state, keccak(contract), `the contract in block ${last.number}`), 'ssss', 'an account')
-    need(hex(account[3]) === CODE, "what is at the contract's address is not RobotLedger of this edition")
-    const slot = (key) => {
-      const value = nodes.get(account[2], keccak(key), "a slot of the contract's storage")
-      const [isList, start, end] = extent(value, 0)
-      need(!isList && end === value.length && end - start <= 32, 'a slot is not in the form of one')
-      return big(value.subarray(start, end))
-    }
-    const base = big(keccak(tk, word(2)))
-    const [packed, , certificatesHash, changed] = [0n, 1n, 2n, 3n].map((n) => slot(word((base + n) % 2n ** 256n)))
-    const state = { revoked: ((packed >> 160n) & 0xffn) !== 0n, chunks: Number((packed >> 168n) & (2n ** 40n - 1n)) }
-    const batches = keccak(tk, word(4))
-    const written = new Map()
-    for (const { first, chunks, block } of events.filter(({ data }) => data)) {
-      const kept = slot(keccak(word(first), batches)) === big(keccak(...chunks.map((chunk) => keccak(chunk))))
-      need(kept && first + chunks.length <= state.chunks, `the contract does not have the batch that begins with ${first}`)
-      chunks.forEach((chunk, n) => written.set(first + n, { chunk, block }))
-    }
-    told(`the contract is RobotLedger and has these chunks, by the stateRoot of block ${last.number}`)
-    need(nodes.used.size === nodes.byHash.size, 'there are nodes of tries that prove nothing')
-
-    // registrations
     const roots = authorities.map(certificate)
     const whole = ({ issuer, subject, key, tbs, r, s }) => issuer !== subject || signed(key, tbs, r, s)
-    need(ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
-    let [before, index, hash, revoked] = [0, 0, 0n, false]
-    const registrations = events.filter(({ data }) => !data)
-    need(registrations.length <= 1000, 'the robot has more than 1,000 registrations and revocations')
-    const signers = registrations.map((event) => {
-      need(event.previous === before && event.index >= index, 'the registrations do not follow each other')
-      ;[before, index, revoked] = [event.block.number, event.index, Boolean(event.revoked)]
-      if (revoked) return { first: index, block: event.block, why: 'revoked' }
-      hash = big(keccak(event.certificates))
+    need(roots.length && ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
+    const signers = file.certificates.map((one) => {
       try {
-        return { first: index, block: event.block, ...signer(event.certificates, roots, robot, event.block.time) }
+        return signer(unhex(one, undefined, 'a certificate'), roots, robot)
       } catch (error) { // whatever the operator registered: of what is no certificate a part may be undefined
-        return { first: index, block: event.block, why: error.message }
+        throw new Wrong(`a certificate of the robot does not hold: ${error.message}`)
       }
     })
-    need(big(word(before)) === changed && hash === certificatesHash && revoked === state.revoked,
-      'the registrations are not those that the contract has')
-    told('the registrations of the robot are all that the contract has')
+    for (const one of signers) told(`the CA made the robot's certificate ${grouped(one.fingerprint)}`)
 
-    // chunks and records
-    const chunks = new Map()
-    const chunkAt = (at) => {
-      const found = written.get(at)
-      need(found, 'no event has this chunk')
-      const chunk = chunkOf(found.chunk)
-      const governing = signers.findLast((one) => one.first <= at)
-      need(governing?.key, `no certificate governs it: ${governing?.why ?? 'none is registered'}`)
-      const form = (purpose) => join(utf8.encode(`rosbridge-eth/2 ${purpose}\0`), log, chunk.encoded)
-      const forms = !chunk.bare ? ['chunk'] : chunk.archived ? ['dropped', 'chunk'] : ['dropped']
-      need(forms.some((one) => signed(governing.key, form(one), chunk.r, chunk.s)), 'the robot did not sign its chunk')
-      need(chunk.sealed <= governing.until, "its chunk was sealed after the end of the robot's certificate")
-      return { ...chunk, block: found.block }
-    }
+    need(ascending(file.chunks.map(({ chunk }) => chunk)), 'the chunks are not in order')
+    const chunks = new Map(file.chunks.map((written) => {
+      const encoded = unhex(written.encoded, undefined, 'a chunk')
+      const hashes = written.hashes.map((one) => hex(unhex(one, 32, 'a hash of a batch')))
+      need(hashes[written.chunk - written.first] === hex(keccak(encoded)),
+        `chunk ${written.chunk} is not the one that its batch has there`)
+      const [chunk, by] = [chunkOf(encoded), signers[written.certificate]]
+      const form = join(utf8.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, chunk.encoded)
+      need(by && signed(by.key, form, chunk.r, chunk.s), `the robot did not sign chunk ${written.chunk}`)
+      need(chunk.sealed <= by.until, `chunk ${written.chunk} was sealed after the end of the robot's certificate`)
+      return [written.chunk, { ...chunk, written }]
+    }))
+    const used = new Set(file.chunks.map((one) => one.certificate))
+    need(used.size === signers.length, 'there are certificates of which no chunk is')
+    told('the robot signed the chunk of each record')
+
     need(ascending(file.records.map(({ chunk, record }) => chunk * 1000 + record)), 'the records are not in order')
     const records = file.records.map(({ chunk, record, line, salt, path }) => {
       try {
-        if (!chunks.has(chunk)) chunks.set(chunk, chunkAt(chunk))
         const of = chunks.get(chunk)
+        need(of, 'its chunk is not in the file')
         const beside = list(path, 'the hashes of a path').map((one) => unhex(one, 32, 'a hash'))
         const holds = proven(of.root, of.records, record, unhex(salt, 16, 'a salt'), utf8.encode(line), beside)
         need(holds, "it is not what the chunk's root commits to")
-        return { chunk, record, line, content: parsed(line, of.longest), sealed: of.sealed, of, block: of.block }
+        return { chunk, record, line, content: parsed(line), sealed: of.sealed, written: of.written }
       } catch (error) {
         throw new Wrong(`record ${record} of chunk ${chunk}: ${error.message}`)
       }
     })
-    for (const one of signers.filter(({ key }) => key)) {
-      told(`the CA made the robot's certificate ${grouped(one.fingerprint)}, used from chunk ${one.first} on`)
-    }
-    told(`the robot signed the chunk of each record, and the record's path leads to the chunk's root`)
+    need(new Set(file.records.map((one) => one.chunk)).size === chunks.size, 'there are chunks of which no record is')
+    told(`each record's path leads to the root of its chunk`)
     return {
-      robot, chain: file.chain_id, genesis: '0x' + file.genesis, contract: '0x' + file.contract, state, blocks, signers,
-      authorities: authorities.map((one) => hex(sm3(one))), records,
+      robot, chain: file.chain_id, genesis: '0x' + file.genesis, contract: '0x' + file.contract,
+      signers: signers.map((one) => one.fingerprint), authorities: authorities.map((one) => hex(sm3(one))), records,
     }
   }
 

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
-from rosbridge_eth.reading.cache import Cache, add_topics, open_cache
-from rosbridge_eth.reading.verdict import Bookmarks, Links, Progress, Verdict, shown
-from rosbridge_eth.reading.verify import EVERYTHING, Bodies, Choice, ProvenChunk, ProvenRecord, Verifier
+from rosbridge_eth.reading.memo import Memo
+from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind, Links, Progress, Verdict, shown
+from rosbridge_eth.reading.verify import EVERYTHING, Choice, ProvenChunk, ProvenRecord, Verifier, digest_of
 from smcrypto import sm2
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger.contract import Block, DataEvent, Ledger, Standing
+    from rosbridge_eth.ledger.contract import Block, Ledger, RegistrationEvent, Standing
 
-MARGIN = 128
-"""Blocks above a batch after which it is kept; the newer ones are asked for again, since a chain may replace them."""
+MAX_TOPICS = 1_000
+BEHIND = 8
+"""Blocks by which a node may be behind another without being told: they are asked one after the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
     """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
 
-    top: the block up to which is read. ledger: on the node that is read. trust, bodies: of who reads. kept: of
-    earlier readings; `chunks` are those behind it. topics: that were read so far.
+    top: the block up to which is read. ledger: on the node that is read. registrations: all of them, as it says.
+    trust: of who reads. topics: that were read so far.
     """
 
     verifier: Verifier
@@ -36,29 +37,32 @@ class Reading:
     nodes: Sequence[str]
     top: Block
     ledger: Ledger
+    registrations: Sequence[RegistrationEvent]
     trust: Trust
-    bodies: Bodies | None = None
-    kept: Cache | None = None
+    memo: Memo | None = None
     topics: set[str] = field(default_factory=set)
 
     def records(self, choice: Choice = EVERYTHING, first: int = 0) -> Iterator[ProvenRecord]:
         """Those that are chosen, from the chunk of index `first` on."""
-        return choice.choose(self._records(choice, first))
+        return choice.choose(self._records(first))
 
-    def _records(self, choice: Choice, first: int) -> Iterator[ProvenRecord]:
-        if self.kept is not None and self.kept.progress.count > first:
-            yield from (one for one in self.kept.records(choice, self.topics) if one.place.chunk >= first)
+    def _records(self, first: int) -> Iterator[ProvenRecord]:
         for chunk in self.chunks:
             if chunk.place.chunk >= first:
-                add_topics(self.topics, (record.content.topic for record in chunk.records))
+                self._add_topics(record.content.topic for record in chunk.records)
                 yield from chunk.records
+
+    def _add_topics(self, more: Iterable[str]) -> None:
+        """For a person who named a topic that is not there: MAX_TOPICS at most, whatever a log holds."""
+        if len(self.topics) < MAX_TOPICS:
+            self.topics.update(islice(more, MAX_TOPICS))
 
     def verdict(self) -> Verdict:
         return self.verifier.verdict(self.nodes)
 
     def close(self) -> None:
-        if self.kept is not None:
-            self.kept.close()
+        if self.memo is not None:
+            self.memo.close()
 
     def keep(self, bookmarks: Bookmarks, *, confirm: bool = False) -> None:
         """Write the bookmark. confirm: the reader has compared the fingerprints of new certificates."""
@@ -69,98 +73,65 @@ class Reading:
 
 def read_robot(
     ledgers: Sequence[Ledger], name: str, *, trust: Trust, reader: sm2.PrivateKey | None, now: float,
-    bookmarks: Bookmarks | None = None, cache: Path | None = None, confirmations: int = 1,
-    bodies: Bodies | None = None, before: Reading | None = None, granted: Mapping[bytes, bytes] | None = None,
+    bookmarks: Bookmarks | None = None, memo: Path | None = None, confirmations: int = 1,
+    before: Reading | None = None, granted: Mapping[bytes, bytes] | None = None,
 ) -> Reading:  # fmt: skip
-    """Begin to read a robot's log, on the node that has most of it; nothing of it is fetched before it is asked for.
+    """Begin to read a robot's log; nothing of it is fetched before it is asked for.
 
-    ledgers: the contract on one node or several. cache: a folder in which what is proven is kept, so that the next
-    reading asks only for what is new. confirmations: read up to the block that has so many, itself counted. bodies: of
-    archived chunks, and granted: see Verifier. before: a reading that came to its end; this one goes on behind it if
-    the chain is the same up to there, and keeps nothing. Raises ChainError; ConfigError for nodes of different ledgers;
-    IdentityError for a name that the contract does not know.
+    ledgers: the contract on one node or several; the first that answers is read, up to a block that all have, and what
+    the others say of the robot there is compared. memo: a folder for the facts that need not be proven again.
+    confirmations: read up to the block that has so many, itself counted. granted: see Verifier. before: a reading that
+    came to its end; this one goes on behind it if the chain and the registrations are the same up to there. Raises
+    ChainError; ConfigError for nodes of different ledgers; IdentityError for a name that the contract does not know.
     """
     tk = robot_id(check_name(name))
-    ledger, top, standing, told = _best(ledgers, tk, confirmations)
+    ledger, top, standing, registrations, told, differing = _compared(ledgers, tk, confirmations)
     block = top.number
-    if standing.account is None:
+    if standing.account is None and not differing:
         raise IdentityError(
             f"no robot of the name {name} is registered in the contract {ledger.contract}; the operator's `status`"
             " lists the names there are"
         )
     log = Log(ledger.ledger, tk)
     mark = None if bookmarks is None else bookmarks.get(log)
-    if mark is not None and confirmations > 1 and standing.chunks < mark.count <= ledger.standings([tk])[0].chunks:
-        mark = replace(mark, count=0)  # it is above the block that is asked for, and not taken back
-    registrations = ledger.registrations(tk, standing)
-    at, links, next_block, kept = Progress(), Links(), 0, None
-    if before is not None and before.verifier.honest and _is_there(ledger, before.top.number, before.top.hash, block):
-        at, links, next_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
-    elif cache is not None and reader is not None:
-        file = f"{name}-{log.ledger.hex()[:16]}{'' if bodies is None else '-archive'}"
-        kept = _kept(partial(open_cache, cache, file, log, reader, trust, granted or {}), ledger, block, told)
-        if kept is not None:
-            at, links, next_block = kept.progress, kept.links, kept.next_block
+    if mark is not None and standing.chunks < mark.count and _is_above(ledger, tk, mark, block):
+        mark = replace(mark, count=0)
+    at, links, first_block = Progress(), Links(), registrations[0].block if registrations else 0
+    if before is not None and not differing and _goes_on(ledger, before, block, registrations):
+        at, links, first_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
+    facts = None
+    if memo is not None and reader is not None:
+        facts = Memo(memo / f"{name}-{log.ledger.hex()[:16]}.sqlite", reader)
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, bodies=bodies, granted=granted,
-        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log),
+        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, granted=granted,
+        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), facts=facts,
     )  # fmt: skip
-    first_block = max(registrations[0].block if registrations else 0, next_block)
-    events = ledger.data_events(tk, first_block, standing.data_block)
-    if kept is None:
-        chunks = verifier.read(events)
-    else:
-        chunks = _keeping(kept, verifier, events, standing.chunks, ledger.block(max(0, block - MARGIN)))
-    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, trust, bodies, kept)
+    for difference in differing:
+        verifier.findings.add(Kind.CONTRADICTED, max(0, standing.chunks - 1), detail=difference)
+    chunks = verifier.read(ledger.data_events(tk, first_block, standing.data_block))
+    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, registrations, trust, facts)
 
 
-def _is_there(ledger: Ledger, number: int, hash_: bytes, block: int) -> bool:
-    """Whether the chain up to `block` has this one, and so all that came before it."""
-    return number <= block and ledger.block(number).hash == hash_
+def _goes_on(ledger: Ledger, before: Reading, block: int, registrations: Sequence[RegistrationEvent]) -> bool:
+    """Whether this node says again what the reading before was told: its last block, so all before, and who signs."""
+    known = before.registrations
+    return (
+        before.verifier.honest and before.top.number <= block and registrations[: len(known)] == known
+        and ledger.block(before.top.number).hash == before.top.hash
+    )  # fmt: skip
 
 
-def _kept(opened: Callable[..., Cache | None], ledger: Ledger, block: int, told: list[str]) -> Cache | None:
-    """What earlier readings have proven, if the chain up to there is the same; empty if it is another one."""
-    kept = opened()
-    if kept is None or kept.block == 0 or _is_there(ledger, kept.block, kept.hash, block):
-        return kept
-    kept.close()
-    if kept.block <= block:
-        told.append(f"the chain has another block {kept.block} than at the reading before: all of it was read anew")
-        return opened(anew=True)
-    told.append(f"what was read before reaches block {kept.block}, above block {block}: it was not used")
-    return None
-
-
-def _keeping(
-    kept: Cache, verifier: Verifier, events: Iterator[DataEvent], chunks: int, final: Block
-) -> Iterator[ProvenChunk]:
-    """The chunks of the events, `chunks` in all; what is in final blocks is kept, unless the node is not honest."""
-
-    def commit(next_block: int, until: int = 0) -> None:
-        """until: the chunks that were read, if none was withheld before `next_block`."""
-        progress = verifier.progress()
-        if verifier.keeps and progress.count >= until and final.number > 0:
-            kept.commit(progress, next_block, final.number, final.hash)
-
-    def finals() -> Iterator[DataEvent]:
-        for event in events:
-            if event.block > final.number:
-                commit(final.number + 1, event.first)
-                yield event
-                break
-            yield event
-        else:
-            commit(final.number + 1, chunks)
-        yield from events
-
-    for chunk in verifier.read(finals()):
-        if chunk.place.block <= final.number and verifier.keeps:
-            kept.add(chunk)
-            if kept.full:
-                commit(chunk.place.block)
-        yield chunk
+def _is_above(ledger: Ledger, tk: bytes, mark: Bookmark, block: int) -> bool:
+    """Whether the node shows the bookmark's chunk above the block: then it is not taken back, only not read yet."""
+    [standing] = ledger.standings([tk])
+    for event in ledger.newest_data(tk, standing.data_block):
+        if event.block <= block:
+            break
+        if event.first < mark.count:
+            ours = event.chunks[mark.count - event.first - 1 : mark.count - event.first]
+            return [digest_of(encoded).hex() for encoded in ours] == [mark.digest]
+    return False
 
 
 def _settled(ledger: Ledger, top: Block, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
@@ -172,27 +143,56 @@ def _settled(ledger: Ledger, top: Block, chunks: Iterator[ProvenChunk]) -> Itera
         )
 
 
-def _best(ledgers: Sequence[Ledger], tk: bytes, confirmations: int) -> tuple[Ledger, Block, Standing, list[str]]:
-    """The node with the highest count, the block up to which it is read, and what the others say otherwise."""
-    answers: list[tuple[Ledger, Block, Standing]] = []
+def _compared(
+    ledgers: Sequence[Ledger], tk: bytes, confirmations: int
+) -> tuple[Ledger, Block, Standing, list[RegistrationEvent], list[str], list[str]]:
+    """The first node that answers, the newest block that all have, and what is said of the robot there.
+
+    Then what is told of nodes, and what one of them says otherwise, or cannot say of that block.
+    """
+    heads: list[tuple[Ledger, int]] = []
     told: list[str] = []
     for ledger in ledgers:
         try:
-            top = ledger.block(max(0, ledger.block_number() - confirmations + 1))
-            [standing] = ledger.standings([tk], top.number)
-            answers.append((ledger, top, standing))
-            if ledger.ledger != answers[0][0].ledger:
-                raise ConfigError(f"{answers[0][0].url} and {ledger.url} are not of one chain and contract")
+            heads.append((ledger, ledger.block_number()))
+            if ledger.ledger != heads[0][0].ledger:
+                raise ConfigError(f"{heads[0][0].url} and {ledger.url} are not of one chain and contract")
         except ChainError as error:
             if len(ledgers) == 1:
                 raise
             told.append(f"node {shown(ledger.url)}: {shown(str(error))}")
-    if not answers:
+    if not heads:
         raise ChainError("none of the nodes answers: " + "; ".join(told))
-    best = max(answers, key=lambda answer: answer[2].chunks)
-    for ledger, top, standing in answers:
-        if standing.chunks != best[2].chunks:
-            told.append(f"node {shown(ledger.url)} shows {standing.chunks:,} chunks only, in block {top.number}")
-        elif standing.tail != best[2].tail:
-            told.append(f"node {shown(ledger.url)} has another last chunk, in block {top.number}: the nodes contradict")
-    return *best, told
+    newest, oldest = max(head for _, head in heads), min(head for _, head in heads)
+    told += [
+        f"node {shown(ledger.url)} is {newest - head:,} blocks behind; all are read up to what it has"
+        for ledger, head in heads if newest - head > BEHIND
+    ]  # fmt: skip
+    block = max(0, oldest - confirmations + 1)
+    ledger, differing = heads[0][0], list[str]()
+    try:
+        top, said = ledger.block(block), _said(ledger, tk, block)
+    except ChainError as error:
+        raise ChainError("; ".join([str(error), *told])) from error
+    for other, _ in heads[1:]:
+        try:
+            differing += [f"{shown(other.url)} {what}" for what in _differences(said, _said(other, tk, block))]
+        except ChainError as error:
+            differing.append(f"{shown(other.url)} does not answer for block {block}: {shown(str(error))}")
+    return ledger, top, *said, told, differing
+
+
+def _said(ledger: Ledger, tk: bytes, block: int) -> tuple[Standing, list[RegistrationEvent]]:
+    [standing] = ledger.standings([tk], block)
+    return standing, ledger.registrations(tk, standing)
+
+
+def _differences(
+    one: tuple[Standing, list[RegistrationEvent]], other: tuple[Standing, list[RegistrationEvent]]
+) -> Iterator[str]:
+    for name, ours, theirs in zip(one[0]._fields, one[0], other[0], strict=True):
+        if ours != theirs:
+            ours, theirs = (value.hex() if isinstance(value, bytes) else value for value in (ours, theirs))
+            yield f"has another {name}: {shown(str(theirs))}, not {shown(str(ours))}"
+    if one[1] != other[1]:
+        yield "shows other registrations"

@@ -1,8 +1,7 @@
 """Following: the same reading asked again when the chain has come on, of which only what is new is given.
 
 Nothing is remembered of the chain but what the reading before ended with. A reading goes on behind it where the chain
-is the same up to there; where it is not (a reorganisation), or a node failed in the middle, it begins at what is kept
-in the reader's home, and so it does every MARGIN blocks, which keeps what has become final since.
+is the same up to there; where it is not (a reorganisation), or a node failed in the middle, it begins anew.
 
 Not here: waiting, and what is made of the records.
 """
@@ -11,12 +10,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from math import inf
 from typing import TYPE_CHECKING, Final
 
-from rosbridge_eth.archive import ArchiveAway
 from rosbridge_eth.errors import ChainError, IdentityError
-from rosbridge_eth.reading.fetch import MARGIN, Reading
+from rosbridge_eth.reading.fetch import Reading
 from rosbridge_eth.reading.verdict import Bookmarks, Kind, shown
 from rosbridge_eth.reading.verify import Choice, ProvenRecord
 
@@ -39,7 +36,7 @@ class Followed:
         self._read, self._bookmarks, self._confirm = read, bookmarks, confirm
         self.reading: Reading | None = None
         self._before: Reading | None = None  # to go on behind
-        self._given, self._until = 0, inf
+        self._given = 0
         self._told: set[tuple[Kind, str]] | None = None  # until it was told how it stands
         self._told_trouble = ""
 
@@ -51,9 +48,7 @@ class Followed:
             if self.reading is None:
                 raise
             raise ChainError(f"the node is behind, or of another chain: {error}") from error
-        before, self._before = self._before, None  # it is used up, also where this one ends in the middle
-        if before is None:
-            self._until = inf if reading.kept is None else reading.top.number + MARGIN
+        self._before = None  # it is used up, also where this one ends in the middle
         try:
             for record in reading.records(choice, self._given):
                 if reading.verifier.shown_all:
@@ -64,8 +59,8 @@ class Followed:
         if reading.verifier.shown_all:
             self._given = max(self._given, reading.verdict().chunks)
         reading.keep(self._bookmarks, confirm=self._confirm)
-        self.reading, self._confirm = reading, False
-        self._before = reading if reading.top.number < self._until else None
+        self.reading = self._before = reading
+        self._confirm = False
 
     def news(self) -> Iterator[str]:
         """For a person who looks on: how it stands after the first reading, then each trouble and finding once."""
@@ -100,7 +95,7 @@ class Following:
                 for record in robot.new(choice, clock()):
                     yield robot.name, record
                 robot.trouble = ""
-            except (ChainError, ArchiveAway) as error:
+            except ChainError as error:
                 robot.trouble = shown(str(error), 300)
                 if any(isinstance(head, bytes) for head in heads):
                     self._heads = []  # to be asked again without a new block

@@ -10,6 +10,7 @@ Memory is bounded: so many points of a trajectory, the newest record of so many 
 from __future__ import annotations
 
 import json
+import socket
 import sys
 import threading
 import time
@@ -17,11 +18,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from io import BufferedReader
 from itertools import islice
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.config.values import Address, time_text
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.reading.follow import EVERY, Followed
@@ -42,6 +43,7 @@ MAX_CONNECTIONS: Final = 64
 QUIET: Final = 15
 """So many seconds without news, and a comment is sent: an end that is gone is noticed."""
 PATIENCE: Final = 10.0
+"""Seconds for a whole request to come, and for an answer to be taken."""
 OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _FILES: Final = {
     "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"), "/live.js": ("live.js", "text/javascript"),
@@ -62,7 +64,7 @@ class View:
         self._made, self._due = (-1, b""), 0.0
         self._about = {"nodes": nodes, "confirmations": confirmations}
         self._tracks = {name: Trajectory(MAX_POINTS) for name in robots}
-        self._latest: dict[str, dict[str, ProvenRecord | dict[str, Any]]] = {name: {} for name in self._tracks}
+        self._latest: dict[str, dict[str, ProvenRecord]] = {name: {} for name in self._tracks}
         self._stands: dict[str, dict[str, Any]] = {name: {} for name in self._tracks}
 
     def write(self, name: str, record: ProvenRecord) -> None:
@@ -70,8 +72,7 @@ class View:
             self._tracks[name].write(record)
             latest = self._latest[name]
             if record.content.topic in latest or len(latest) < MAX_TOPICS:
-                # What is shown of it is made when it is asked for; an image of an archive is not kept until then.
-                latest[record.content.topic] = record if len(record.line) <= MAX_LINE else _values(record)
+                latest[record.content.topic] = record  # what is shown of it is made when it is asked for
             self.version += 1
 
     def show(self, robots: Iterable[Followed]) -> None:
@@ -88,8 +89,7 @@ class View:
                 return self._made
             robots = [
                 {"name": name, **self._stands[name], "tracks": _tracks(track),
-                 "latest": [one if isinstance(one, dict) else _values(one)
-                            for _, one in sorted(self._latest[name].items())]}
+                 "latest": [_values(one) for _, one in sorted(self._latest[name].items())]}
                 for name, track in self._tracks.items()
             ]  # fmt: skip
             state = json.dumps(self._about | {"robots": robots}, separators=(",", ":")).encode()
@@ -185,6 +185,21 @@ def _host(header: str) -> str | None:
         return None
 
 
+class _Request(socket.SocketIO):
+    """What comes on a connection, until PATIENCE is over: whoever sends a byte now and then holds no thread."""
+
+    def __init__(self, connection: socket.socket, patience: float) -> None:
+        super().__init__(connection, "r")
+        self._connection, self._end = connection, time.monotonic() + patience
+
+    def readinto(self, buffer: Any) -> int | None:
+        left = self._end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._connection.settimeout(left)
+        return super().readinto(buffer)
+
+
 class _Handler(BaseHTTPRequestHandler):
     view: View
     names: frozenset[str]
@@ -192,7 +207,12 @@ class _Handler(BaseHTTPRequestHandler):
     files: Mapping[str, tuple[bytes, str]]
     timeout, server_version, sys_version = PATIENCE, "rosbridge-eth", ""
 
+    def setup(self) -> None:
+        super().setup()
+        self.rfile = BufferedReader(_Request(self.connection, self.timeout))
+
     def do_GET(self) -> None:
+        self.connection.settimeout(self.timeout)
         # A site that gave its own name this machine's address (DNS rebinding) comes with its own name here.
         if _host(self.headers.get("Host", "")) not in self.names:
             self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")

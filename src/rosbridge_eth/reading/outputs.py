@@ -1,7 +1,7 @@
 """What a reader makes of proven records: JSON lines, a table, a bag that ROS tools open, a picture.
 
 Each output takes records one by one, so that one pass over a log fills them all, and stands under its name only when
-it is whole; or it grows there (.mcap, .csv), and others can read what there is after every `flush`.
+it is whole; or it grows there (.mcap), and others can read what there is after every `flush`.
 
 A bag says no more than what was recorded:
 
@@ -17,16 +17,14 @@ another are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
 import struct
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
@@ -35,10 +33,8 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy
-from rosbags.interfaces import Nodetype
 
 from rosbridge_eth.capture import Restoration, TypeLine, Wire, decoder_for_known
-from rosbridge_eth.capture.definitions import TIME
 from rosbridge_eth.capture.restoration import NOT_FINITE
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ConfigError, SourceError, VerificationError
@@ -53,7 +49,7 @@ MAX_NAME: Final = 255
 MAX_TRACKS: Final = 32
 """Topics in one picture; what is on further ones is left out."""
 MAX_POINTS: Final = 1 << 13
-_BATCH: Final = 4_096  # rows of a Parquet file that are made at once
+_BATCH: Final = 4_096  # rows of a table that are made at once
 _FARTHEST: Final = 1e12
 """Metres from the origin; a position beyond is no position."""
 _HIGHEST: Final = 1e300
@@ -74,8 +70,8 @@ def proof(record: ProvenRecord) -> dict[str, Any]:
     place = record.place
     return {
         "chunk": place.chunk, "record": record.number, "stream": place.stream.hex(), "number": place.number,
-        "digest": place.digest.hex(), "block": place.block, "block_time": time_text(place.block_time * 10**9),
-        "transaction": "0x" + place.transaction.hex(),
+        "digest": place.digest.hex(), "sealed": time_text(place.sealed_ms * 10**6), "block": place.block,
+        "block_time": time_text(place.block_time * 10**9), "transaction": "0x" + place.transaction.hex(),
     }  # fmt: skip
 
 
@@ -111,15 +107,15 @@ def check_table(path: Path) -> None:
     """ConfigError unless a table can be written there."""
     if path.suffix not in (".csv", ".parquet"):
         raise ConfigError(f"{path}: a table is a .csv or a .parquet file")
-    if path.suffix == ".parquet" and not find_spec("pyarrow"):
-        raise ConfigError(f"{path}: Parquet needs pyarrow: pip install pyarrow, or name a .csv file")
+    if not find_spec("pandas") or (path.suffix == ".parquet" and not find_spec("pyarrow")):
+        raise ConfigError(f"{path}: a table takes pandas and, for Parquet, pyarrow: pip install 'pysmcrypto[table]'")
     _new(path, "table")
 
 
-_FIXED: Final = {
-    "topic": "text", "type": "text", "source": "text", "received_ns": "time", "captured_ns": "time", "clock": "bool",
-    "stream": "text", "number": "uint", "chunk": "int", "record": "int", "block": "int", "transaction": "text",
-}  # fmt: skip
+_FIXED: Final = (
+    "topic", "type", "source", "received_ns", "captured_ns", "clock", "stream", "number", "chunk", "record", "block",
+    "transaction",
+)
 """Columns of every table; after them those of the messages' fields, a dot between the levels.
 
 One that has the name of a column here begins with a dot.
@@ -127,68 +123,60 @@ One that has the name of a column here begins with a dot.
 
 
 class Table:
-    """Rows are kept in a file until all columns, and what kinds of values they have, are known.
+    """Rows wait in a file until all columns, and what kinds of values they have, are known."""
 
-    grows: the CSV file to which `flush` brings the rows; it is written anew where they brought another column.
-    """
-
-    def __init__(self, rows: Any, grows: Path | None = None) -> None:
-        self._rows, self._grows = rows, grows
-        self._flushed, self._header = 0, -1  # how far the rows are there, under so many columns
-        self._columns: dict[str, set[str]] = {}
+    def __init__(self, rows: Any) -> None:
+        self._rows = rows
+        self._columns: dict[str, set[str]] = {name: set() for name in _FIXED}
 
     def write(self, record: ProvenRecord) -> None:
         content, place = record.content, record.place
-        times = _time_fields(record.definition)
-        cells = {printable(name): value for name, value in flattened(content.data, "")}
-        for column, value in cells.items():
-            if column in self._columns or (len(self._columns) < MAX_COLUMNS and len(column) <= MAX_NAME):
-                kind = _kind(value)
-                self._columns.setdefault(column, set()).add("time" if kind == "int" and column in times else kind)
-        row = [
+        row = dict(zip(_FIXED, (
             content.topic, content.type_name, content.source, content.received_ns, content.captured_ns, content.clock,
             place.stream.hex(), place.number, place.chunk, record.number, place.block, "0x" + place.transaction.hex(),
-            cells,
-        ]  # fmt: skip
+        ), strict=True))  # fmt: skip
+        for name, value in flattened(content.data, ""):
+            column = printable(name)
+            if len(column) <= MAX_NAME:
+                row[f".{column}" if column.lstrip(".") in _FIXED else column] = value
+        for column, value in row.items():
+            if column in self._columns or len(self._columns) < MAX_COLUMNS + len(_FIXED):
+                self._columns.setdefault(column, set()).add(_kind(value))
         self._rows.write(json.dumps(row) + "\n")
 
-    def _read(self, start: int = 0) -> Iterator[list[Any]]:
-        self._rows.seek(start)
-        for row in self._rows:
-            *fixed, cells = json.loads(row)
-            yield [*fixed, *(cells.get(column) for column in self._columns)]
-
-    def _names(self, fixed: Collection[str]) -> Iterator[str]:
-        yield from fixed
-        yield from (f".{column}" if column.lstrip(".") in fixed else column for column in self._columns)
-
-    def flush(self) -> None:
-        if self._grows is not None:
-            self.write_csv(self._grows)
+    def _frames(self, values: Callable[[str, list[Any]], Any]) -> Iterator[Any]:
+        """Frames of so many rows; one without rows where there are none. values: of a column's name and its cells."""
+        self._rows.seek(0)
+        rows = [json.loads(line) for line in islice(self._rows, _BATCH)]
+        while True:
+            columns = {name: values(name, [row.get(name) for row in rows]) for name in self._columns}
+            yield import_module("pandas").DataFrame(columns)
+            if not (rows := [json.loads(line) for line in islice(self._rows, _BATCH)]):
+                return
 
     def write_csv(self, path: Path) -> None:
-        """What is not there yet."""
-        anew = len(self._columns) != self._header
-        with path.open("w" if anew else "a", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            if anew:
-                writer.writerow([_cell(column) for column in self._names(_FIXED)])
-            writer.writerows(map(_cell, row) for row in self._read(0 if anew else self._flushed))
-        self._flushed, self._header = self._rows.seek(0, 2), len(self._columns)
+        series = import_module("pandas").Series
+
+        def values(name: str, cells: list[Any]) -> Any:
+            return series(list(map(_cell, cells)), dtype=object)  # else integers beside nothing become floats
+
+        for number, frame in enumerate(self._frames(values)):
+            heads = list(map(_cell, frame.columns))
+            frame.to_csv(path, mode="a", index=False, header=not number and heads)
 
     def write_parquet(self, path: Path) -> None:
-        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-        kinds = [{kind} for kind in _FIXED.values()] + list(self._columns.values())
-        types, values = zip(*(_arrow(pyarrow, found) for found in kinds), strict=True)
-        names = self._names([column.removesuffix("_ns") for column in _FIXED])
-        schema, rows = pyarrow.schema(zip(names, types, strict=True)), self._read()
-        with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-            while batch := list(islice(rows, _BATCH)):
-                columns = [
-                    pyarrow.array([None if cell is None else value(cell) for cell in column], kind)
-                    for column, value, kind in zip(zip(*batch, strict=True), values, types, strict=True)
-                ]
-                writer.write_batch(pyarrow.record_batch(columns, schema=schema))
+        pandas, pyarrow = import_module("pandas"), import_module("pyarrow")
+        types = {name: _arrow(pyarrow, name, kinds) for name, kinds in self._columns.items()}
+
+        def values(name: str, cells: list[Any]) -> Any:
+            type_, value = types[name]
+            made = pyarrow.array([None if cell is None else value(cell) for cell in cells], type_)
+            return pandas.arrays.ArrowExtensionArray(made)
+
+        schema = pyarrow.schema([(name, type_) for name, (type_, _) in types.items()])
+        with import_module("pyarrow.parquet").ParquetWriter(path, schema, compression="zstd") as writer:
+            for frame in self._frames(values):
+                writer.write_table(pyarrow.Table.from_pandas(frame, schema, preserve_index=False))
 
 
 def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -201,10 +189,9 @@ def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _kind(value: Any) -> str:
-    """Of a cell: bool, int, float, nan (text that may stand for a float), text, ints, floats, json."""
+    """Of a cell: bool, int, float, nan (text that may stand for a float), text, list (of numbers), json."""
     if isinstance(value, list):
-        kinds = set(map(_kind, value))
-        return "ints" if kinds <= {"int"} else "floats" if kinds <= _NUMBERS else "json"
+        return "list" if {*map(_kind, value)} <= _NUMBERS else "json"
     if isinstance(value, str):
         return "nan" if value in NOT_FINITE else "text"
     if type(value) is int:
@@ -215,65 +202,41 @@ def _kind(value: Any) -> str:
 _NUMBERS: Final = {"int", "float", "nan"}
 
 
-def _arrow(pyarrow: Any, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
+def _arrow(pyarrow: Any, name: str, kinds: set[str]) -> tuple[Any, Callable[[Any], Any]]:
     """The type of a column whose cells are of these kinds, and what makes its value of a cell."""
-    if kinds == {"time"}:
+    if name in ("received_ns", "captured_ns"):
         return pyarrow.timestamp("ns", tz="UTC"), int
     if kinds == {"bool"}:
         return pyarrow.bool_(), bool
-    if kinds == {"uint"}:
-        return pyarrow.uint64(), int
-    if kinds <= {"int", "time"}:
+    if kinds == {"int"}:
         return pyarrow.int64(), int
     if kinds <= _NUMBERS:
         return pyarrow.float64(), float
-    if kinds == {"ints"}:
-        return pyarrow.list_(pyarrow.int64()), list
-    if kinds <= {"ints", "floats"}:
+    if kinds == {"list"}:
         return pyarrow.list_(pyarrow.float64()), lambda cell: list(map(float, cell))
     return pyarrow.string(), str if kinds <= {"text", "nan"} else json.dumps
 
 
-@lru_cache(maxsize=256)
-def _time_fields(definition: TypeLine | None) -> frozenset[str]:
-    """Paths of a type's fields that are points in time."""
-    if definition is None:
-        return frozenset()
-    try:
-        fields = definition.decoder().fields
-    except VerificationError:
-        return frozenset()
-
-    def walk(type_name: str, path: str) -> Iterator[str]:
-        for name, (node, kind) in fields.get(type_name, ()):
-            if node == Nodetype.NAME:
-                yield from [path + name] if kind == TIME else walk(str(kind), f"{path}{name}.")
-
-    return frozenset(walk(definition.type_name, ""))
+_FORMULA: Final = re.compile(r"(^|[;,|])(?=\s*[=+\-@\uff1d\uff0b\uff0d\uff20])")
+"""Where a spreadsheet may take text for a formula: at its beginning, also in full-width signs, and behind what another
+country's spreadsheets divide cells by."""
 
 
 def _cell(value: Any) -> Any:
     """Text without what acts on a terminal, and not to be taken for a formula by a spreadsheet."""
-    if isinstance(value, list):
+    if isinstance(value, list | dict):
         return json.dumps(value)
     if not isinstance(value, str) or value in NOT_FINITE:
         return value
-    text = printable(value)
-    return "'" + text if text.startswith(("=", "+", "-", "@")) else text
+    return _FORMULA.sub(r"\1'", printable(value))
 
 
 @contextmanager
-def table(path: Path, *, grows: bool = False) -> Iterator[Table]:
-    """A row each record, a column each field that is no message; arrays as JSON in one cell, in Parquet as lists.
-
-    grows: a .csv file is there from the beginning; one of Parquet has its columns' types when all of it is known.
-    """
+def table(path: Path) -> Iterator[Table]:
+    """A row each record, a column each field that is no message; arrays as JSON in one cell, in Parquet as lists."""
     check_table(path)
-    grows = grows and path.suffix == ".csv"
-    where = nullcontext(path) if grows else _whole(path)
-    with where as within, tempfile.TemporaryFile("w+", dir=within.parent) as rows:
-        made = Table(rows, path if grows else None)
-        made.flush()
+    with _whole(path) as within, tempfile.TemporaryFile("w+", dir=within.parent) as rows:
+        made = Table(rows)
         yield made
         (made.write_csv if path.suffix == ".csv" else made.write_parquet)(within)
 

@@ -28,6 +28,8 @@ from smcrypto import sm2
 
 MAX_FINDINGS: Final = 500
 """Findings kept one by one, notices only among the first half; what is above that is counted by kind."""
+MAX_PLACES: Final = 100
+"""Runs of chunks that are kept of a finding."""
 MAX_SHOWN: Final = 120
 
 
@@ -41,16 +43,16 @@ class Kind(Enum):
     MISSING = "missing", True, "place", "the robot wrote more before this than the chain has"
     FORKED = "forked", True, "place", "the robot's log branches here, or goes back"
     UNTRUSTED = "untrusted", True, "chunk", "no certificate of this robot that is to be trusted governs this"
-    WITHHELD = "withheld", True, "chunk", "counted by the contract and not shown by node or archive"
+    WITHHELD = "withheld", True, "chunk", "counted by the contract and not shown by the node"
     ROLLED_BACK = "rolled-back", True, "place", "what an earlier reading found here is not here now"
+    CONTRADICTED = "contradicted", True, "difference", "the nodes do not say the same of this robot"
     UNOPENABLE = "unopenable", True, "chunk", "the signature holds and the content does not"
-    DROPPED = "dropped", False, "record", "dropped by the robot, whose disk was full"
+    DROPPED = "dropped", False, "record", "dropped by the robot, whose disk or spool was full"
     LOST = "lost", False, "message", "not captured, says the robot"
     TRIGGERED = "triggered", False, "event", "what the robot kept in memory for it is written"
     RESTARTED = "restarted", False, "restart", "began anew without having said goodbye"
     NEW_CERTIFICATE = "new-certificate", False, "certificate", "not known to this reader: compare its fingerprint"
     NO_GRANT = "no-grant", False, "record", "not for this reader"
-    ARCHIVED = "archived", False, "record", "in an archive that was not looked into"
     CLOCK = "clock", False, "time", "the robot's clock may have been wrong"
 
     label: str
@@ -70,19 +72,34 @@ class Kind(Enum):
 
 @dataclass(slots=True)
 class Finding:
-    """first, last: indices of chunks in the robot's log on the chain, both included. detail: safe to show."""
+    """places: first and last index of each run of chunks in the robot's log on the chain, both included, ascending.
+
+    more: places that are not among them, since there would be more than MAX_PLACES. detail: safe to show.
+    """
 
     kind: Kind
-    first: int
-    last: int
+    places: list[tuple[int, int]]
     count: int
     detail: str
+    more: int = 0
 
     def __str__(self) -> str:
-        where = f"chunk {self.first}" if self.first == self.last else f"chunks {self.first} to {self.last}"
-        return f"{self.kind.label}: {where}: {self.kind.counted(self.count)}: {self.kind.meaning}" + (
+        runs = [str(first) if first == last else f"{first} to {last}" for first, last in self.places]
+        where = f"chunk{'' if runs == [str(self.places[0][0])] else 's'} {', '.join(runs)}"
+        more = f" and {self.more:,} places behind" if self.more else ""
+        return f"{self.kind.label}: {where}{more}: {self.kind.counted(self.count)}: {self.kind.meaning}" + (
             f" ({self.detail})" if self.detail else ""
         )
+
+    def add(self, first: int, last: int, count: int) -> None:
+        self.count += count
+        begin, end = self.places[-1]
+        if begin <= first <= end + 1 and not self.more:
+            self.places[-1] = begin, max(end, last)
+        elif len(self.places) < MAX_PLACES:
+            self.places.append((first, last))
+        else:
+            self.more += 1
 
 
 class Findings:
@@ -90,17 +107,17 @@ class Findings:
 
     def __init__(self, counts: Mapping[str, int], kept: Iterable[Finding]) -> None:
         self.counts: Counter[str] = Counter(counts)
-        self.kept = [replace(one) for one in kept]
+        self.kept = [replace(one, places=[*one.places]) for one in kept]
         self._latest = {(one.kind, one.detail): one for one in self.kept}
 
     def add(self, kind: Kind, first: int, last: int | None = None, *, count: int = 1, detail: str = "") -> None:
         last = first if last is None else last
         self.counts[kind.label] += count
         known = self._latest.get((kind, detail))
-        if known is not None and (not kind.violation or first <= known.last + 1):
-            known.last, known.count = max(known.last, last), known.count + count
+        if known is not None and (not kind.violation or first <= known.places[-1][1] + 1):
+            known.add(first, last, count)
         elif len(self.kept) < (MAX_FINDINGS if kind.violation else MAX_FINDINGS // 2):
-            found = self._latest[kind, detail] = Finding(kind, first, last, count, detail)
+            found = self._latest[kind, detail] = Finding(kind, [(first, last)], count, detail)
             self.kept.append(found)
 
     @property
@@ -119,22 +136,35 @@ class Head(NamedTuple):
 
 
 class Links:
-    """Of the robot's chunks that were read: the first 8 bytes of each digest, and its index."""
+    """Of the robot's chunks that were read: the first 8 bytes of each digest, its index, and whether it has no body."""
 
     def __init__(self) -> None:
-        self.digests, self.indices = array("Q"), array("Q")
+        self.digests, self.indices, self.dropped = array("Q"), array("Q"), array("B")
 
-    def add(self, digest: bytes, index: int) -> None:
+    def add(self, digest: bytes, index: int, dropped: bool) -> None:
         self.digests.append(int.from_bytes(digest[:8], "big"))
         self.indices.append(index)
+        self.dropped.append(dropped)
 
-    def index_of(self, digest: bytes) -> int | None:
-        """Where a chunk with a header of this digest was read."""
+    def _find(self, digest: bytes) -> int | None:
         if not self.digests:
             return None
         known = numpy.frombuffer(self.digests, numpy.uint64)
         found = numpy.flatnonzero(known == int.from_bytes(digest[:8], "big"))
-        return self.indices[int(found[0])] if len(found) else None
+        return int(found[0]) if len(found) else None
+
+    def index_of(self, digest: bytes) -> int | None:
+        """Where a chunk with a header of this digest was read."""
+        at = self._find(digest)
+        return None if at is None else self.indices[at]
+
+    def restore(self, digest: bytes) -> bool:
+        """Whether only the dropped form of this chunk was read; from now on the whole one was."""
+        at = self._find(digest)
+        if at is None or not self.dropped[at]:
+            return False
+        self.dropped[at] = False
+        return True
 
 
 @dataclass(slots=True)

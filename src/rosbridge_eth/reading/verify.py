@@ -12,14 +12,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from eth_hash.auto import keccak
 
 from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line
 
 from rosbridge_eth.chunk import (  # isort: skip
-    Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id, signed_as,
+    Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id,
+    verify_signature,
 )  # fmt: skip
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import IdentityError, VerificationError
@@ -43,11 +44,16 @@ LAST_MOMENT: Final = 253_402_300_799
 """The end of 9999 in seconds since 1970; what a node says is later is taken for that."""
 
 
-Bodies: TypeAlias = Callable[[bytes, int], bytes | None]
+class Facts(Protocol):
+    """What was proven once, by the SM3 of what it is about: a dict, or memo.Memo."""
+
+    def get(self, name: bytes, /) -> bytes | None: ...
+    def __setitem__(self, name: bytes, value: bytes, /) -> None: ...
 
 
 class Place(NamedTuple):
-    """Where a chunk stands. chunk: its index in the robot's log on the chain. block_time: seconds since 1970."""
+    """Where a chunk stands. chunk: its index in the robot's log on the chain. block_time: seconds since 1970, by the
+    chain; sealed_ms: milliseconds, by the robot."""
 
     chunk: int
     stream: bytes
@@ -56,6 +62,7 @@ class Place(NamedTuple):
     block: int
     block_time: int
     transaction: bytes
+    sealed_ms: int
 
 
 class ProvenRecord(NamedTuple):
@@ -126,29 +133,25 @@ class Verifier:
 
     standing: of the robot, at the block up to which is read. registrations: all of them, oldest first.
     reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
-    bodies: of an archived chunk's body, by its digest and length, what the archive has, None where it has nothing;
-    without it archived records are told and not opened. granted: by a chunk's digest, the content key that another
-    reader handed over.
+    granted: by a chunk's digest, the content key that another reader handed over.
     at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
     now: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
-    may have chunks of this robot.
+    may have chunks of this robot. facts: of earlier readings; new ones are added.
     """
 
     def __init__(
         self, name: str, ledger: bytes, standing: Standing, registrations: Sequence[RegistrationEvent], *,
         trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
         mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
-        elsewhere: Sequence[bytes] = (), bodies: Bodies | None = None, granted: Mapping[bytes, bytes] | None = None,
+        elsewhere: Sequence[bytes] = (), granted: Mapping[bytes, bytes] | None = None, facts: Facts | None = None,
     ) -> None:  # fmt: skip
-        self.name, self.log = name, Log(ledger, robot_id(name))
-        self._bodies, self._granted = bodies, granted or {}
+        self.name, self.log, self._facts = name, Log(ledger, robot_id(name)), facts
+        self._granted = granted or {}
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
         self._now, self._elsewhere = now, elsewhere[:MAX_ELSEWHERE]
         self._at, self.links = deepcopy(at or Progress()), links or Links()
         self.findings = Findings(self._at.found, self._at.findings)
-        # What a reading goes on behind was honest, so what was withheld there was so by an archive.
-        self._bodies_withheld = self.findings.counts[Kind.WITHHELD.label]
         self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
         self._last: bytes | None = None  # the newest chunk, as it came
         self._marked = mark is None or mark.count <= self._at.count  # whether the mark's chunk was compared
@@ -250,23 +253,28 @@ class Verifier:
 
     def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
-        chunk, purpose, signer = self.authentic(index, encoded)
-        header = chunk.header
-        self._follow(index, header)
-        self._check_clock(index, header, signer, event.block)
-        self._at.head = Head(header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye)
-        if chunk.body and sm3.digest(chunk.body) != header.body_digest:
+        chunk, signer = self.authentic(index, encoded)
+        header, head = chunk.header, self._at.head
+        altered = bool(chunk.body) and sm3.digest(chunk.body) != header.body_digest
+        whole = not chunk.bare and not altered and head is not None and header.previous.hex() != head.digest
+        if not (whole and self.links.restore(header.digest)):  # else its dropped form has the place already
+            self._follow(index, chunk)
+            self._check_clock(index, header, signer, event.block)
+            self._at.head = Head(
+                header.stream.hex(), header.number, header.digest.hex(), header.sealed_ms, header.goodbye
+            )
+        if altered:
             raise Refused(Kind.ALTERED, "the body is not the one that the header names")
-        if purpose == "dropped":
-            raise Refused(Kind.DROPPED, count=header.records)
         if chunk.bare:
-            chunk = replace(chunk, body=self._body(header))
+            raise Refused(Kind.DROPPED, count=header.records)
         time = self._time(event.block)
-        place = Place(index, header.stream, header.number, header.digest, event.block, time, event.transaction)
+        place = Place(
+            index, header.stream, header.number, header.digest, event.block, time, event.transaction, header.sealed_ms
+        )  # fmt: skip
         return self._open(place, chunk)
 
-    def authentic(self, index: int, encoded: bytes) -> tuple[Chunk, str, Governing]:
-        """The chunk that the robot wrote, for what purpose it signed it, and what governs it; else Refused.
+    def authentic(self, index: int, encoded: bytes) -> tuple[Chunk, Governing]:
+        """The chunk that the robot wrote, and what governs it; else Refused.
 
         The body is not looked at. index: in the robot's log; it does not go back from call to call.
         """
@@ -280,31 +288,28 @@ class Verifier:
         if signer is None or signer.key is None:
             raise Refused(Kind.UNTRUSTED, "no certificate is registered" if signer is None else signer.why)
         try:
-            purpose = signed_as(self.log, signer.key, chunk)
+            self._verify_signature(signer.key, chunk)
         except Forged:
             elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
             raise Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
         if chunk.header.sealed_ms > signer.ends_ms:
             end = time_text(signer.ends_ms * 10**6)
             raise Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
-        return chunk, purpose, signer
+        return chunk, signer
 
-    def _body(self, header: Header) -> bytes:
-        """From the archive. It is refused as withheld where the archive has none, or another."""
-        if self._bodies is None:
-            raise Refused(Kind.ARCHIVED, count=header.records)
-        body = self._bodies(header.body_digest, header.body_length)
-        if body is None or len(body) != header.body_length or sm3.digest(body) != header.body_digest:
-            self._bodies_withheld += 1
-            what = "is not in the archive" if body is None else "is another in the archive"
-            raise Refused(Kind.WITHHELD, f"the body {header.body_digest.hex()} {what}")
-        return body
+    def _verify_signature(self, key: sm2.PublicKey, chunk: Chunk) -> None:
+        about = self.log.ledger + self.log.tk + key.to_bytes() + bytes([chunk.bare]) + chunk.signature
+        name = sm3.digest(b"signature" + about + chunk.header.encoded)
+        if self._facts is None or self._facts.get(name) is None:
+            verify_signature(self.log, key, chunk)
+            if self._facts is not None:
+                self._facts[name] = b""
 
     # --- links
 
-    def _follow(self, index: int, header: Header) -> None:
+    def _follow(self, index: int, chunk: Chunk) -> None:
         """Tell where the chunk does not follow the newest one; one that was read already is refused."""
-        head = self._at.head
+        head, header = self._at.head, chunk.header
         follows = header.previous == (NO_DIGEST if head is None else bytes.fromhex(head.digest))
         same_stream = head is not None and header.stream.hex() == head.stream
         ahead = header.number - (head.number + 1 if head is not None and same_stream else 0)
@@ -320,7 +325,7 @@ class Verifier:
         if head is not None and not same_stream and (knows_none or not head.goodbye):
             detail = "it knows of nothing before: what it held is lost" if knows_none else ""
             self.findings.add(Kind.RESTARTED, index, detail=detail)
-        self.links.add(header.digest, index)
+        self.links.add(header.digest, index, chunk.bare)
 
     def _tell_break(self, index: int, header: Header, ahead: int, same_stream: bool) -> None:
         """Forked where the robot wrote something else at this place or after what it follows; else missing."""
@@ -351,7 +356,14 @@ class Verifier:
         try:
             if self._reader is None:
                 raise NoGrant(f"{header} is opened with a reader's key")
-            return content_key(header, self._reader)
+            name = sm3.digest(b"content key" + self._reader.public_key.to_bytes() + header.encoded)
+            known = self._facts and self._facts.get(name)
+            if known:
+                return known
+            key = content_key(header, self._reader)
+            if self._facts is not None:
+                self._facts[name] = key
+            return key
         except NoGrant:
             if header.digest not in self._granted:
                 raise
@@ -370,15 +382,15 @@ class Verifier:
             if key and key == self._granted.get(place.digest):  # who gave it could open the chunk
                 raise VerificationError(f"a wrong key was granted for {chunk.header}: remove that grant") from None
             raise Refused(Kind.UNOPENABLE, shown(str(error))) from None
-        records = tuple(self._parsed(place, lines, chunk.header.max_line))
+        records = tuple(self._parsed(place, lines))
         self._at.records += len(records)
         return ProvenChunk(place, chunk, key, lines, records)
 
-    def _parsed(self, place: Place, lines: Sequence[bytes], most: int) -> Iterator[ProvenRecord]:
+    def _parsed(self, place: Place, lines: Sequence[bytes]) -> Iterator[ProvenRecord]:
         unsynchronised = 0
         for number, line in enumerate(lines):
             try:
-                content = parse_line(line, most)
+                content = parse_line(line)
             except VerificationError as error:
                 self.findings.add(Kind.UNOPENABLE, place.chunk, detail=f"line {number}: {shown(str(error))}")
                 continue
@@ -415,17 +427,13 @@ class Verifier:
     @property
     def shown_all(self) -> bool:
         """Whether the node kept nothing back so far."""
-        return self.findings.counts[Kind.WITHHELD.label] == self._bodies_withheld
+        return self.findings.counts[Kind.WITHHELD.label] == 0
 
     @property
     def honest(self) -> bool:
-        """Whether the node kept nothing back, and showed again what it showed before."""
-        return self.shown_all and not self.findings.counts[Kind.ROLLED_BACK.label]
-
-    @property
-    def keeps(self) -> bool:
-        """Whether what was read need not be read again: the archive, too, kept nothing back."""
-        return self.honest and not self._bodies_withheld
+        """Whether the node kept nothing back, showed again what it showed before, and no other node contradicts it."""
+        counts = self.findings.counts
+        return self.shown_all and not counts[Kind.ROLLED_BACK.label] and not counts[Kind.CONTRADICTED.label]
 
     def progress(self) -> Progress:
         """Where the reading stands, between two chunks. New certificates are not in it: they are told anew."""
@@ -445,9 +453,18 @@ class Verifier:
         return Bookmark(self._at.count, self._at.digest, tuple(dict.fromkeys(known)))
 
 
+def digest_of(encoded: bytes) -> bytes:
+    """The identity of a chunk, or of what is none."""
+    try:
+        return Chunk.parse(encoded).header.digest
+    except Malformed:
+        return sm3.digest(encoded)
+
+
 def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
     """Whether the robot signed this header, for this form of the chunk."""
     try:
-        return bool(signed_as(log, key, chunk))
+        verify_signature(log, key, chunk)
     except Forged:
         return False
+    return True

@@ -134,7 +134,6 @@ MISTAKES = {
     'topics = ["/a"]\n[log]\nperiod = 1': "log.period is 1; write a duration with its unit, such as",
     'topics = ["/a"]\n[log]\ncompress = "no"': "log.compress is 'no'; input should be a valid boolean",
     'topics = ["/a"]\n[capture]\nfield_limit = "1 MiB"': "field_limit is '1 MiB'; it should be at most '48 KiB'",
-    'topics = ["/a"]\n[capture]\nstore = "archiv"': "capture.store is 'archiv'; input should be 'chain' or 'archive'",
     'topics = ["/a"]\n[source]\nkind = "ros1"\nmaster = "robot:11311"': "source.master is 'robot:11311'; write the",
     'topics = ["/a"]\n[source]\nkind = "ros1"\nhostname = "a:1"': "source.hostname is 'a:1'; write a name or an",
     'topics = [{topic = "/a", at = 2026-01-01T00:00:00Z, rate = 1, for = "2s"}]': (

@@ -642,19 +642,3 @@ def test_a_server_of_a_readers_name_is_revoked_without_it(world: World, tmp_path
     assert (world.home.readers / "server.pem").exists()
     with registry(world) as known:
         assert known.find("reader", "server") and not known.find("server", "server")
-
-
-def test_an_archive_that_is_named_is_made_and_told_to_readers(tmp_path: Path):
-    home, reader = OperatorHome(tmp_path / "operator"), ReaderHome(tmp_path / "owner")
-    keys = admin.init_home(home, PASSPHRASE, reader=reader, reader_passphrase=PASSPHRASE, now=NOW,
-                           listen="127.0.0.1:7410", archive=str(tmp_path / "bodies"))  # fmt: skip
-    assert (tmp_path / "bodies").is_dir() and keys is not None
-    named = load_server_config(home.config).archive
-    assert named is not None and named.url == tmp_path / "bodies"
-    home.reader_config.write_text('contract = "0x1"\n')
-    home.config.write_text(home.config.read_text() + 'endpoint = "https://s3.example.org"\nkeys = "of the server"\n')
-    later = ReaderHome(tmp_path / "later")
-    admin.add_reader(home, "later", later, ca=load_ca(home.ca, PASSPHRASE, NOW), passphrase=PASSPHRASE, now=NOW)
-    assert later.config.read_text() == (
-        f'contract = "0x1"\n\n[archive]\nurl = "{tmp_path / "bodies"}"\nendpoint = "https://s3.example.org"\n'
-    )

@@ -12,27 +12,31 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle, take_up
+from rosbridge_eth.cli.robot import _say_who
+from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.identity import Role, load_identity
+from rosbridge_eth.robot import reader_keys
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
-CA, OTHER_CA = (ids.create_ca("CA", at=NOW) for _ in range(2))
+CA, OTHER_CA = (ids.create_ca("CA", at=NOW - timedelta(days=1000)) for _ in range(2))
 READER = ids.enrol(CA, Role.READER, "owner", at=NOW).public
 END = BridgeEnd("robot_1", "server", "192.0.2.7:7410", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 
 
 def answer(
-    request: Request, *, ca: ids.CertificateAuthority = CA, role: Role = Role.ROBOT, end: BridgeEnd = END
+    request: Request, *, ca: ids.CertificateAuthority = CA, role: Role = Role.ROBOT, end: BridgeEnd = END,
+    at: datetime = NOW,
 ) -> Bundle:
     """What `register` makes of a request."""
-    peer = ids.enrol_requests(ca, role, request.name, request.signing, request.encryption, at=NOW)
+    peer = ids.enrol_requests(ca, role, request.name, request.signing, request.encryption, at=at)
     certificates = {
         "sign.crt.pem": peer.signing_certificate.to_pem().decode(),
         "enc.crt.pem": peer.encryption_certificate.to_pem().decode(),
         "ca.crt.pem": CA.certificate.to_pem().decode(),
     }
-    return Bundle(end, certificates, {"owner": READER.pem.decode()})
+    return Bundle(end, certificates, {"owner": READER.pem.decode()}).signed(CA.key)
 
 
 def with_keys(password: bytes = b"robot's") -> Bundle:
@@ -40,7 +44,7 @@ def with_keys(password: bytes = b"robot's") -> Bundle:
     files = ids.identity_files(ids.enrol(CA, Role.ROBOT, "robot_1", at=NOW), [CA.certificate], password)
     text = {name: content.decode() for name, content in files.items()}
     keys = {name: text.pop(name) for name in ids.KEY_FILES}
-    return Bundle(END, text, {"owner": READER.pem.decode()}, keys)
+    return Bundle(END, text, {"owner": READER.pem.decode()}, keys).signed(CA.key)
 
 
 @pytest.fixture
@@ -55,7 +59,7 @@ def test_a_robot_makes_its_keys_and_is_certified_without_showing_them(home: Robo
         home.bridge()
     sent = answer(request).encode()
     assert not needs_password(sent) and b"PRIVATE" not in sent + home.request.read_bytes()
-    assert join(home, read_bundle(sent)) == CA.certificate.fingerprint().hex()
+    assert join(home, read_bundle(sent)) == (CA.certificate.fingerprint().hex(), ["owner"])
     identity, roots = load_identity(home.identity, b"robot's")
     assert identity.name == "robot_1" and roots == (CA.certificate,)
     assert home.bridge() == END and kind_of(home.path) is HomeKind.ROBOT
@@ -169,12 +173,94 @@ def test_a_request_that_was_altered_is_refused() -> None:
     {"end": {}}, {"end": 5}, {"readers": {"../x": "pem"}}, {"certificates": 7}, {"keys": None}, {"readers": [5]},
     {"readers": {"owner": 5}}, {"certificates": {"sign.crt.pem": 5}}, {"keys": {"sign.key.pem": None}},
     {"end": asdict(END) | {"genesis": "0x1"}}, {"end": asdict(END) | {"chain_id": "one"}},
-    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"server_address": None}},
+    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"server_address": None}}, {"signature": 7},
+    {"end": asdict(END) | {"contract": "0x" + "22 " * 20}}, {"end": asdict(END) | {"server_name": "a\x1b[2Jb"}},
+    {"end": asdict(END) | {"server_name": "\u202eb"}}, {"end": asdict(END) | {"server_address": "\x1b[2J:7410"}},
+    *({"end": asdict(END) | {"server_address": f"{host}:7410"}} for host in (
+        "0.0.0.0", "[::]", "0", "0x0", "00.00.0.0", "[::0]", "[0:0:0:0:0:0:0:0]", "[::ffff:0.0.0.0]", "[::ffff:0:0]")),
+    {"end": asdict(END) | {"server_address": "192.0.2.7:0"}},
 ])
 def test_a_bundle_that_was_damaged_is_refused(change: dict[str, object]) -> None:
     bundle = answer(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))))
-    with pytest.raises(IdentityError):
+    with pytest.raises(IdentityError) as caught:
         read_bundle(json.dumps(json.loads(bundle.encode()) | change).encode())
+    assert str(caught.value).isprintable()
+
+
+EXPIRED = ids.enrol(CA, Role.READER, "late", at=NOW - timedelta(days=900)).public
+STRANGER = ids.enrol(OTHER_CA, Role.READER, "stranger", at=NOW).public
+ROBOT_2 = ids.enrol(CA, Role.ROBOT, "robot_2", at=NOW).public
+
+
+def altered(bundle: Bundle, **change: object) -> Bundle:
+    """As it comes out of a file that somebody changed."""
+    return read_bundle(json.dumps(json.loads(bundle.encode()) | change).encode())
+
+
+def test_a_reader_who_is_added_to_a_bundle_on_its_way_is_refused(home: RobotHome) -> None:
+    """Even one whom the CA certified: the robot cannot know that it was revoked."""
+    request = ask_to_join(home, "robot_1", b"robot's")
+    bundle, owner = answer(request), READER.pem.decode()
+    revoked = ids.enrol(CA, Role.READER, "revoked", at=NOW).public.pem.decode()
+    changes: list[dict[str, object]] = [
+        {"readers": {"owner": owner, "revoked": revoked}}, {"readers": {"owner": revoked}}, {"readers": {}},
+        {"signature": ""}, {"signature": "00" * 64}, {"signature": "zz"}, {"signature": bundle.signature[2:]},
+        {"end": asdict(replace(END, server_address="192.0.2.66:7410"))}, {"end": asdict(replace(END, chain_id=5))},
+    ]
+    for change in changes:
+        with pytest.raises(IdentityError, match="not what the CA signed"):
+            join(home, altered(bundle, **change))
+    theirs = replace(bundle, readers={"owner": owner, "revoked": revoked}).signed(OTHER_CA.key)
+    with pytest.raises(IdentityError, match="not what the CA signed"):
+        join(home, theirs)
+    assert not home.bridge_file.exists() and not list(home.readers.iterdir())
+    join(home, altered(bundle))
+
+
+@pytest.mark.parametrize(("name", "reader"), [
+    ("late", EXPIRED), ("stranger", STRANGER), ("robot_2", ROBOT_2), ("other", READER),
+])
+def test_only_readers_of_the_ca_who_had_not_ended_are_taken_by_their_own_names(
+    home: RobotHome, name: str, reader: ids.PeerIdentity
+) -> None:
+    request = ask_to_join(home, "robot_1", b"robot's")
+    bundle = replace(answer(request), readers={"owner": READER.pem.decode(), name: reader.pem.decode()}).signed(CA.key)
+    with pytest.raises(IdentityError):
+        join(home, bundle)
+    assert not home.bridge_file.exists() and not list(home.readers.iterdir())
+
+
+def test_an_older_bundle_is_not_taken_up_again(home: RobotHome) -> None:
+    """It names the readers of then."""
+    request = ask_to_join(home, "robot_1", b"robot's")
+    old, new = answer(request, at=NOW), answer(request, at=NOW + timedelta(days=3))
+    join(home, old)
+    join(home, new)
+    with pytest.raises(IdentityError, match="older than the one"):
+        join(home, old)
+    join(home, new)
+
+
+def test_who_joins_is_told_the_readers_by_name(home: RobotHome, capsys: pytest.CaptureFixture[str]) -> None:
+    request = ask_to_join(home, "robot_1", b"robot's")
+    other = ids.enrol(CA, Role.READER, "insurer", at=NOW).public.pem.decode()
+    bundle = replace(answer(request), readers={"owner": READER.pem.decode(), "insurer": other}).signed(CA.key)
+    _say_who(join(home, bundle))
+    assert "these may read what this robot writes: insurer, owner." in capsys.readouterr().err
+
+
+def test_a_robot_does_not_seal_for_a_reader_whose_certificates_have_ended(
+    home: RobotHome, caplog: pytest.LogCaptureFixture
+) -> None:
+    join(home, answer(ask_to_join(home, "robot_1", b"robot's")))
+    (home.readers / "late.pem").write_bytes(EXPIRED.pem)
+    home.raise_clock_floor(NOW.timestamp() + 10 * 86_400)
+    config = load_robot_config(home.config)
+    assert reader_keys(config, home, [CA.certificate]) == [READER.encryption_certificate.public_key]
+    assert "not sealed for reader late: its certificate ended at" in caplog.text
+    (home.readers / "owner.pem").unlink()
+    with pytest.raises(ConfigError, match="certificates of all readers have ended"):
+        reader_keys(config, home, [CA.certificate])
 
 
 @pytest.mark.parametrize("part", ["certificates", "keys"])
@@ -253,8 +339,9 @@ def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_cras
 ) -> None:
     bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
     pem, real = READER.pem.decode(), Path.unlink
-    before = replace(bundle, readers={"owner": pem, "stays": pem, "goes": pem})
-    after = replace(bundle, readers={"owner": pem, "stays": pem, "comes": pem})
+    stays, goes, comes = (ids.enrol(CA, Role.READER, n, at=NOW).public.pem.decode() for n in ("stays", "goes", "comes"))
+    before = replace(bundle, readers={"owner": pem, "stays": stays, "goes": goes}).signed(CA.key)
+    after = replace(bundle, readers={"owner": pem, "stays": stays, "comes": comes}).signed(CA.key)
 
     def dies(path: Path, missing_ok: bool = False) -> None:
         if path.suffix == ".pem":

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.files import box_head, open_box, read_file, seal_box, write_atomically
 
-HEAD = {"format": "rosbridge-eth bundle 2", "name": "robot_1"}
+HEAD = {"format": "rosbridge-eth bundle 3", "name": "robot_1"}
 FORMAT = HEAD["format"]
 BOX = seal_box(b"a secret", b"horse", HEAD, n=2)
 

@@ -31,7 +31,7 @@ def test_a_clock_that_cannot_be_read_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", HomeKind)
 def test_a_home_says_whose_it_is_and_no_other_command_takes_it(kind: HomeKind, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="nobody's home; `init --home`"):
+    with pytest.raises(ConfigError, match="not a home; `init --home`"):
         kind_of(tmp_path)
     make_home(tmp_path, kind, name="x")
     assert kind_of(tmp_path) is kind and home_of(tmp_path)["name"] == "x"

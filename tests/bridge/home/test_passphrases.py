@@ -57,7 +57,6 @@ def test_an_empty_or_missing_file_is_refused_by_name(tmp_path: Path, content: by
 @pytest.mark.parametrize("name, confirm, option", [
     ("operator", False, "--passphrase-file"), ("operator", True, "--passphrase-file"),
     ("reader", False, "--passphrase-file"), ("reader", True, "--password-file"), ("robot", False, "--password-file"),
-    ("keystore", True, "--password-file"),
 ])
 def test_without_a_terminal_it_does_not_wait(
     name: str, confirm: bool, option: str, monkeypatch: pytest.MonkeyPatch

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -378,6 +379,18 @@ for start in range(0, groups * 5, 5):
 """
 
 
+def rewritten(server) -> None:
+    """Have Redis write its log anew, as docs/howto-redis.md says for one that was killed.
+
+    7.0.15 cuts a torn command off its log, and leaves those before it of the same transaction: the start after the next
+    carries them out, and rows stand there twice.
+    """
+    with server.client() as client:
+        client.bgrewriteaof()
+        while any(client.info("persistence")[key] for key in ("aof_rewrite_in_progress", "aof_rewrite_scheduled")):
+            time.sleep(0.01)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_and_started_again_under_load_it_loses_nothing_and_doubles_nothing(server, seed):
     """Three writers go on through three SIGKILLs of Redis at random moments."""
@@ -407,6 +420,7 @@ def test_killed_and_started_again_under_load_it_loses_nothing_and_doubles_nothin
             kill_at.pop(0)
             server.kill()
             server.start()
+            rewritten(server)
         listeners[0].join(0.001)
     assert [child.wait() for child in children] == [0] * writers
     assert (told, kill_at) == ([groups] * writers, [])

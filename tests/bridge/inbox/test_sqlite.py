@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import stat
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from bridge.chunks import STREAM, chain, chunk
 from rosbridge_eth.chunk import Chunk
 from rosbridge_eth.database import DiskFull
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.inbox import Outcome
+from rosbridge_eth.inbox import InboxExchanged, Outcome
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 
 A = b"a" * 32
@@ -34,6 +35,28 @@ def path(tmp_path: Path) -> Path:
 def numbers(inbox: SqliteInbox) -> list[int]:
     positions = [row.position for row in inbox.rows(A, None, PLENTY)]
     return [Chunk.parse(encoded).header.number for encoded in inbox.chunks(A, positions)]
+
+
+def test_an_old_copy_that_is_put_back_is_told_to_who_committed_since(path, tmp_path):
+    one, two = open_file(path), open_file(path)
+    put = lambda inbox, *given: inbox.append([(A, chunk) for chunk in given], 1.0)  # noqa: E731
+    made = list(chain(9))
+    put(one, *made[:4])
+    put(two, made[4])
+    with closing(sqlite3.connect(path)) as file, closing(sqlite3.connect(tmp_path / "copy")) as copy:
+        file.backup(copy)
+        put(one, *made[5:7])
+        copy.backup(file)
+    assert put(two, made[8]) == [Outcome.STORED], "all that this one was told is stored is there"
+    for given in (made[7:8], ()):
+        with pytest.raises(InboxExchanged, match="an old copy of the inbox"):
+            put(one, *given)
+        assert put(one, *given) in ([Outcome.KNOWN], []), "told once; what is asked anew is answered by what is there"
+        with closing(sqlite3.connect(path)) as file, closing(sqlite3.connect(tmp_path / "copy")) as copy:
+            put(one, made[8])
+            copy.backup(file)
+    one.close()
+    two.close()
 
 
 def test_the_file_is_for_its_owner_alone(path):

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from eth_account import Account
 
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.ledger.accounts import Keyring
@@ -110,9 +109,3 @@ def test_the_file_is_its_owners_and_never_written_over(tmp_path: Path):
         Keyring.load(path, b"p")
     with pytest.raises(IdentityError, match="cannot be read"):
         Keyring.load(tmp_path / "none", b"p")
-
-
-def test_an_export_is_a_keystore_that_others_open():
-    exported = Keyring.from_mnemonic(WORDS).export(1, b"secret")
-    assert exported["version"] == 3
-    assert Account.from_key(Account.decrypt(exported, "secret")).address == KNOWN[1]

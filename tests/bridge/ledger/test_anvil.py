@@ -191,58 +191,37 @@ def test_a_chain_stays_the_same_however_often_its_node_is_started(tmp_path: Path
     assert sorted(numbers) == list(range(len(numbers))), "one first block, the chain's own"
 
 
-def test_a_kill_costs_what_was_not_saved_and_never_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_chain_that_was_kept_goes_on_at_the_time_of_day(tmp_path: Path):
+    for _ in range(2):
+        with start(free_port(), state=tmp_path / "chain") as running:
+            before = int(time.time())
+            running.ask("evm_mine")
+            made = int(running.ask("eth_getBlockByNumber", "latest", False)["timestamp"], 16)
+            assert before - 1 <= made <= time.time() + 2
+        time.sleep(1.1)
+
+
+def test_a_kill_costs_what_was_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nodes, "STATE_SECONDS", 1)
     port, state = free_port(), tmp_path / "chain"
     genesis, chunks = chain_state(port, state, write=3)
-    monkeypatch.setattr(nodes, "SAVE_SECONDS", 0.05)
-    monkeypatch.setattr(nodes, "SAVE_SHARE", 0)
-    for _ in range(3):
-        running = start(port, state=state)
-        ledger = Ledger(running.url, (tmp_path / "contract").read_text())
-        for _ in range(5):
-            chunks.append(os.urandom(5_000))
-            ledger.set_data(ROBOT, TK, chunks[-1:])
-            json.loads(state.read_bytes())  # whole at every moment
-        running.kill()
-        assert not running.running()
-        found = chain_state(port, state)
-        assert found[0] == genesis
-        assert 3 <= len(found[1]) <= len(chunks)
-        assert found[1] == chunks[: len(found[1])]
-        chunks = found[1]
-    assert list(tmp_path.glob(".chain*")) == []
-
-
-def test_a_disk_that_takes_nothing_is_said_and_the_chain_is_saved_when_it_does_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(nodes, "SAVE_SECONDS", 0.05)
-    monkeypatch.setattr(nodes, "SAVE_SHARE", 0)
-    (folder := tmp_path / "disk").mkdir()
-    running = start(free_port(), state=folder / "chain")
-    folder.rename(tmp_path / "away")
-    running.ask("anvil_mine", "0x1")
-    deadline = time.monotonic() + 30
-    while "the chain's state is not saved" not in caplog.text:
-        assert time.monotonic() < deadline, "nobody is told"
-        time.sleep(0.02)  # the saving thread has a clock of its own
-    (tmp_path / "away").rename(folder)
-    before = (folder / "chain").stat().st_ino
-    while (folder / "chain").stat().st_ino == before:
-        assert time.monotonic() < deadline, "nothing is saved any more"
-        time.sleep(0.02)
-    running.ask("anvil_mine", "0x1")
-    folder.rename(tmp_path / "away")
-    with pytest.raises(ChainError, match="cannot be written"):
-        running.stop()
+    running = start(port, state=state)
+    ledger = Ledger(running.url, (tmp_path / "contract").read_text())
+    running.fund(account := "0x" + "ab" * 20, 1)
+    running.keeps(account)
+    ledger.set_data(ROBOT, TK, [b"perhaps lost"])
+    running.kill()
     assert not running.running()
+    found = chain_state(port, state)
+    assert found[0] == genesis and found[1][:3] == chunks and len(found[1]) in (3, 4)
 
 
-def test_the_size_is_known_and_a_large_one_is_told(tmp_path: Path, monkeypatch, caplog: pytest.LogCaptureFixture):
-    monkeypatch.setattr(nodes, "TOLD_FROM", 1000)
+def test_what_is_not_written_is_waited_for_and_then_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(nodes, "START_SECONDS", 10.0)
     with start(free_port(), state=tmp_path / "chain") as running:
-        assert running.state_size == (tmp_path / "chain").stat().st_size > 1000
-    assert "use geth" in caplog.text
+        monkeypatch.setattr(nodes, "START_SECONDS", 0.2)
+        with pytest.raises(ChainError, match="is there room on the disk"):
+            running.keeps("0x" + "cd" * 20)
 
 
 def test_it_ends_with_the_process_that_started_it_also_where_that_is_killed(tmp_path: Path, node: Anvil) -> None:

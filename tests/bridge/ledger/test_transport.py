@@ -64,7 +64,7 @@ def test_an_answer_that_comes_a_byte_now_and_then_is_given_up(through_a_proxy: b
                 url = "http://node.example"
             with pytest.raises(ChainUnavailable, match="too slow"):
                 Ledger(url, CONTRACT, timeout=0.5).block_number()
-            assert time.monotonic() - began < 2
+            assert time.monotonic() - began < 10
 
 
 def test_a_node_that_says_nothing_is_given_up():

@@ -26,10 +26,6 @@ from bridge.log.making import (
 )
 from rosbridge_eth import chunk as chunks
 from rosbridge_eth.chunk import (
-    MAX_ARCHIVED_BODY,
-    MAX_ARCHIVED_CHUNK,
-    MAX_ARCHIVED_LINE,
-    MAX_ARCHIVED_PLAINTEXT,
     MAX_BODY,
     MAX_CHUNK,
     MAX_LINE,
@@ -45,14 +41,11 @@ from rosbridge_eth.chunk import (
     NoGrant,
     TooLarge,
     Unopenable,
-    check_proof,
     content_key,
     drop,
     ledger_id,
     open_lines,
-    proofs,
     robot_id,
-    signed_as,
     verify,
     zstd,
 )
@@ -399,88 +392,19 @@ def test_reprs_show_neither_content_nor_keys():
     assert str(CHUNK.header) == "chunk 3 of stream 00010203"
 
 
-# Archived chunks
-
-
-def archived(lines=LINES, **changes):
-    return sealed(lines, archived=True, **changes)
-
-
-def test_an_archived_chunk_opens_as_any_other_and_goes_on_the_chain_without_its_body():
-    chunk = archived()
-    assert chunk.header.archived and not chunk.header.goodbye and opened(chunk) == LINES
-    verify(LOG, ROBOT.public_key, chunk)
-    assert Chunk.parse(chunk.encoded) == chunk
-    assert chunk.on_chain == Chunk(chunk.header, chunk.signature, b"") and chunk.on_chain.bare
-    assert Chunk.parse(chunk.on_chain.encoded) == chunk.on_chain
-    assert CHUNK.on_chain is CHUNK and not CHUNK.header.archived
-    check_proof(chunk.header.root, len(LINES), LINES[2], next(proofs(LINES, content_key(chunk.header, READER), [2])))
-
-
-def test_the_signature_tells_an_archived_chunk_from_a_dropped_one_and_nobody_makes_one_of_the_other():
-    chunk = archived()
-    dropped = drop(LOG, ROBOT, chunk)
-    assert signed_as(LOG, ROBOT.public_key, chunk) == signed_as(LOG, ROBOT.public_key, chunk.on_chain) == "chunk"
-    assert signed_as(LOG, ROBOT.public_key, dropped) == "dropped"
-    verify(LOG, ROBOT.public_key, dropped)
-    with pytest.raises(Altered, match="is not with it"):  # a robot that hands over a header and no body
-        verify(LOG, ROBOT.public_key, chunk.on_chain)
-    with pytest.raises(Forged):  # what the robot has dropped is not to be had, even where somebody still has it
-        verify(LOG, ROBOT.public_key, Chunk(chunk.header, dropped.signature, chunk.body))
-    with pytest.raises(Forged):  # without the flag no purpose but "dropped" goes without a body
-        signed_as(LOG, ROBOT.public_key, Chunk(CHUNK.header, CHUNK.signature, b""))
-    for bad in (STRANGER.public_key, READER.public_key):
-        with pytest.raises(Forged):
-            signed_as(LOG, bad, chunk.on_chain)
-
-
-@given(
-    st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 2, 3]), st.integers(0, 1001), st.integers(0, 1), st.booleans()
-)
-@example(MAX_ARCHIVED_BODY, 2, 1, 1, True)
-@example(MAX_ARCHIVED_BODY + 64, 2, 1, 1, True)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0, 1, 2, 3, 128]), st.integers(0, 1001), st.integers(0, 1),
+       st.booleans())  # fmt: skip
 @example(MAX_BODY, 0, 1, 1, True)
 @example(MAX_BODY + 64, 0, 1, 1, True)
-@example(MAX_BODY + 64, 3, 1, 1, True)
-@example(0, 2, 0, 0, True)
-def test_only_an_archived_chunk_has_a_long_body_and_it_has_records(size, flags, records, grants, fitting):
+@example(MAX_BODY, 2, 1, 1, True)
+@example(MAX_BODY, 3, 1, 1, True)
+def test_a_body_has_its_bound_and_no_flag_but_goodbye_is_known(size, flags, records, grants, fitting):
     size = size // 64 * 64 + 16 if fitting and records else size
     data = header_bytes(CHUNK.header, flags=flags, records=records, body_length=size, n=grants)
     data = data if grants else data[:139]
-    most = MAX_ARCHIVED_BODY if flags & 2 else MAX_BODY
-    if grants and 1 <= records <= 1000 and 16 < size <= most and size % 64 == 16:
+    if flags < 2 and grants and 1 <= records <= 1000 and 16 < size <= MAX_BODY and size % 64 == 16:
         header = Header.parse(data)
-        assert (header.archived, header.goodbye, header.body_length) == (flags > 1, bool(flags & 1), size)
+        assert (header.goodbye, header.body_length) == (bool(flags), size)
     else:
         with pytest.raises(Malformed):
             Header.parse(data)
-
-
-def test_an_archived_chunk_without_records_is_malformed():
-    with pytest.raises(Malformed):
-        Header.parse(header_bytes(EMPTY.header, flags=2))
-    with pytest.raises(Malformed):
-        archived([])
-
-
-@pytest.mark.parametrize("compress", [True, False])
-def test_the_longest_line_fits_an_archived_chunk_whatever_it_holds(compress):
-    noise = repeating()(MAX_ARCHIVED_LINE).replace(b"\n", b" ")
-    chunk = archived([noise], compress=compress)
-    assert opened(chunk) == (noise,) and len(chunk.body) <= MAX_ARCHIVED_BODY
-    assert len(chunk.encoded) <= MAX_ARCHIVED_CHUNK
-    with pytest.raises(TooLarge):
-        archived([noise, noise[: 128 * 1024]], compress=compress)
-    with pytest.raises(TooLarge):  # of one for the chain nothing has changed
-        sealed([noise], compress=compress)
-
-
-def test_an_archived_chunk_unpacks_to_no_more_than_its_bound():
-    def bomb(size):
-        return zstd.compress(b"a" * (size - 1) + b"\n")
-
-    fits, over = (lying(bomb(size), flags=2, root=root_of([b"a" * (size - 1)])) for size in
-                  (MAX_ARCHIVED_PLAINTEXT, MAX_ARCHIVED_PLAINTEXT + 1))  # fmt: skip
-    assert len(opened(fits)[0]) == MAX_ARCHIVED_PLAINTEXT - 1
-    with pytest.raises(Unopenable):
-        opened(over)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from bridge.log.making import LOG, READER, ROBOT, repeating
 from rosbridge_eth.chunk import (
-    MAX_ARCHIVED_LINE,
     MAX_BODY,
     MAX_LINE,
     MAX_RECORDS,
@@ -25,7 +24,7 @@ from rosbridge_eth.chunk import (
     open_lines,
     verify,
 )
-from rosbridge_eth.writer import MAX_ARCHIVED_JSON, MAX_JSON, LogWriter
+from rosbridge_eth.writer import MAX_JSON, LogWriter
 from smcrypto import sm2
 
 STREAM_LINE = b'{"stream":{"source":"sim"}}'
@@ -361,93 +360,31 @@ def test_a_new_reader_opens_the_next_chunk_and_finds_the_definitions_in_it():
         read(chunk(8.0))
 
 
-# For the archive
-
-
-def kinds(chunks: list[Chunk]) -> list[tuple[bool, tuple[bytes, ...]]]:
-    """Whether each is archived, and its lines."""
-    return [(chunk.header.archived, read(chunk)) for chunk in chunks]
-
-
-def test_lines_for_the_archive_make_chunks_of_their_own_in_the_same_stream():
-    made = started()
-    made.add(message(0), 2.0)
-    made.add(message(1), 2.1, archived=True)
-    made.add(message(2), 2.2)
-    assert made.next_timer() == 3.0
-    chunks = made.closed(3.2, 0)
-    assert sorted(kinds(chunks)) == [(False, (message(0), message(2))), (True, (message(1),))]
-    assert [chunk.header.number for chunk in chunks] == [1, 2] and chunks[1].header.previous == chunks[0].header.digest
-    assert made.next_timer() == 3.2 + 3600.0
-
-
-def test_what_is_needed_to_read_the_archive_is_on_the_chain_before_it():
-    made = writer()
-    made.add(message(0, 50_000), 0.1, ("A", b"def A"), archived=True)
-    made.add(message(1), 0.2, ("A", b"def A"), archived=True)
-    made.add(message(2), 0.3, ("B", b"def B"), archived=True)
-    made.add(message(3), 0.4, ("A", b"def A, changed"), archived=True)
-    made.add(message(4), 0.5, ("A", b"def A, changed"))
-    chunks = made.finish(0)
-    check_links(chunks)
-    assert kinds(chunks) == [
-        (False, (STREAM_LINE, b"def A")), (True, (message(0, 50_000), message(1))),
-        (False, (b"def B",)), (True, (message(2),)),
-        (False, (b"def A, changed",)), (True, (message(3),)),
-        (False, (message(4),)),
-    ]  # fmt: skip
-    assert [chunk.header.goodbye for chunk in chunks] == [False] * 6 + [True]
-
-
-def test_a_run_of_nothing_but_images_says_goodbye_on_the_chain():
-    made = started()
-    made.add(message(0), 2.0, archived=True)
-    assert kinds(chunks := made.finish(0)) == [(True, (message(0),)), (False, ())]
-    assert chunks[-1].header.goodbye
-
-
-def test_an_archived_chunk_is_closed_at_four_mebibytes_and_one_long_line_fits():
-    made = started()
-    for i in range(4):
-        made.add(noise(i, MAX_ARCHIVED_JSON // 4), 2.0, archived=True)
-    assert made.next_timer() == 2.0
-    made.add(noise(9, MAX_ARCHIVED_LINE), 2.1, archived=True)
-    with pytest.raises(TooLarge):
-        made.add(bytes(MAX_ARCHIVED_LINE + 1), 2.1, archived=True)
-    with pytest.raises(TooLarge):
-        made.add(noise(1, MAX_LINE + 1), 2.1)
-    chunks = made.closed(3.2, 0)
-    assert [len(lines) for archived, lines in kinds(chunks) if archived] == [4, 1]
-
-
 @given(
-    st.lists(st.tuples(st.booleans(), st.sampled_from(["", "A", "B"]), st.sampled_from([b"1", b"2"]), st.floats(0, 2))),
+    st.lists(st.tuples(st.sampled_from(["", "A", "B"]), st.sampled_from([b"1", b"2"]), st.floats(0, 2))),
     st.booleans(),
 )  # fmt: skip
 @settings(max_examples=60)
-def test_whatever_comes_stands_in_order_each_kind_by_itself_behind_its_definition(added, again):
+def test_whatever_comes_stands_in_order_behind_its_definition(added, again):
     made, now, chunks = writer(), 0.0, []
-    for i, (archived, kind, version, after) in enumerate(added):
+    for i, (kind, version, after) in enumerate(added):
         now += after
-        made.add(message(i), now, (kind, b"def " + kind.encode() + version) if kind else None, archived=archived)
+        made.add(message(i), now, (kind, b"def " + kind.encode() + version) if kind else None)
         chunks += made.closed(now, 0)
         if again and i == len(added) // 2:
             made.new_stream()
     chunks += made.finish(0)
     check_links(chunks)
-    assert chunks[-1].header.goodbye and not chunks[-1].header.archived
-    for wanted in (False, True):
-        lines = [line for archived, lines in kinds(chunks) if archived is wanted for line in lines]
-        assert [line for line in lines if line.startswith(b"{\"n\"")] == [
-            message(i) for i, (archived, *_) in enumerate(added) if archived is wanted
-        ]
+    assert chunks[-1].header.goodbye
     known: dict[str, bytes] = {}
+    seen = []
     for chunk in chunks:
         known = {} if chunk.header.number == 0 else known
         for line in read(chunk):
             if line.startswith(b"def "):
-                assert not chunk.header.archived
                 known[line[4:5].decode()] = line[5:]
             elif line != STREAM_LINE:
-                _, kind, version, _ = added[json.loads(line)["n"]]
+                seen.append(json.loads(line)["n"])
+                kind, version, _ = added[seen[-1]]
                 assert not kind or known[kind] == version
+    assert seen == [*range(len(added))]

@@ -77,6 +77,7 @@ def _made(tmp_path_factory: pytest.TempPathFactory) -> Place:
     join(robot, read_bundle(made.bundle.read_bytes()))
     for name, words in (("pass", PASSPHRASE), ("word", PASSWORD), ("readers", READERS)):
         (folder / name).write_bytes(words)
+        (folder / name).chmod(0o600)
     return place
 
 

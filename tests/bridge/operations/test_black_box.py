@@ -89,11 +89,9 @@ def seen(home: RobotHome) -> dict[str, list[Any]]:
 
 
 @pytest.mark.parametrize("pace", ["max", "100"])
-@pytest.mark.parametrize("store", ["chain", "archive"])
-def test_a_bag_gives_the_records_around_each_event_at_any_pace(robot: RobotHome, bag: Path, pace: str, store: str):
+def test_a_bag_gives_the_records_around_each_event_at_any_pace(robot: RobotHome, bag: Path, pace: str):
     speed = '"max"' if pace == "max" else "100.0"
-    topics = TOPICS.replace('"crash" }', f'"crash", store = "{store}" }}')
-    running = opened(robot, f'{topics}{CRASH}\n[source]\nkind = "bag"\npath = "{bag}"\nspeed = {speed}\n')
+    running = opened(robot, f'{TOPICS}{CRASH}\n[source]\nkind = "bag"\npath = "{bag}"\nspeed = {speed}\n')
     until_the_end(running)
     found = seen(robot)
     assert found["/odom"] == [*range(0, 600, 10)] and len(found["/bumper"]) == 120, "the others are written always"

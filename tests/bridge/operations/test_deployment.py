@@ -98,7 +98,6 @@ def test_the_conditions_that_rules_ask_for_are_said_by_the_program():
     for condition in re.findall(r'condition\{name="([^"]+)"\}', RULES):
         assert f'CONDITION.labels("{condition}")' in source
     assert 'CONDITION.labels(f"{process} stores chunks")' in source
-    assert 'CONDITION.labels(f"{process} archives bodies")' in source
 
 
 def test_the_page_names_every_exit_code():
@@ -122,7 +121,7 @@ def test_every_command_on_a_page_exists_with_its_options(page: str):
 
 
 def test_every_extra_that_is_named_is_one_of_the_distribution():
-    """In what the programs and the pages say: `pip install '.[bridge]'`, `NAME[parquet]`, a wheel's `…whl[bridge]`."""
+    """In what the programs and the pages say: `pip install '.[bridge]'`, `NAME[table]`, a wheel's `…whl[bridge]`."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     files = [*(ROOT / "src").rglob("*.py"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), ROOT / ".ci/run"]
     form = re.compile(r"([\w.-]*smcrypto[\w.-]*|(?<=')\.|WHEEL)\[([a-z0-9,]+)\]")

@@ -34,7 +34,6 @@ COMPARE = ("compare", str(sample_bag()), "robot_1", "--topic", "/robot_1/odom", 
 EVIDENCE = ("evidence", "robot_1", "evidence.json", *READER)
 VECTOR = PAGE.parents[1] / "tests" / "vectors" / "evidence"
 VERIFY = ("verify", str(VECTOR / "span.json"), "--ca", str(VECTOR / "ca.crt.pem"))
-CHECK = ("check", "robot_1", STREAM.hex(), "0")
 GRANT = ("grant", "robot_1", "--from", "2026-01-01T00:00:00Z", "--to", "2100-01-01T00:00:00Z",
          "--reader", "reader/public.pem", *READER)  # fmt: skip
 Given = Callable[[Place, Keyring], object]
@@ -125,9 +124,7 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("the node is away", REVOKE, as_it_is),
     ("it was revoked already", REVOKE, lambda place, keys: run(REVOKE)),
     ("the name is used", ("register", "robot_1", "robot/request.json", *OPERATOR), as_it_is),
-    ("the chunk waits", CHECK, waiting),
-    ("the chunk is known nowhere", CHECK, dead),
-    ("no robot of that name was ever enrolled", ("check", "robot_9", STREAM.hex(), "0"), as_it_is),
+    ("no robot of that name was ever enrolled", ("status", "robot_9"), as_it_is),
     ("what is there is sound", ("read", "robot_1", *READER), as_it_is),
     ("what is there is not what", ("read", "robot_1", *READER), forged),
     ("it is sound, and every record is sealed for others", ("read", "robot_1", *READER), written),
@@ -141,7 +138,6 @@ CASES: list[tuple[str, tuple[str, ...], Given]] = [
     ("one is missing", COMPARE, lambda place, keys: replayed(place, keys, without=7)),
     ("there is no such bag", ("compare", "none.bag", "robot_1", *READER), replayed),
     ("no record was chosen", (*EVIDENCE, "--topic", "/other"), replayed),
-    ("the node does not give the proofs", (*EVIDENCE, "--topic", "/robot_1/odom"), replayed),
     ("all of it holds", VERIFY, as_it_is),
     ("something does not hold", ("verify", "robot/request.json", *VERIFY[2:]), as_it_is),
     ("shown", ("status",), as_it_is),

@@ -114,7 +114,7 @@ def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
     robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal and robot.chunks else None)
     for text in (robot.summary, " ".join(warnings(caplog))):
         assert "register --replace" in text
-    assert re.search(r"[1-9]\d* chunks kept for later", robot.summary)
+    assert re.search(r"[1-9]\d* chunks not yet at the server", robot.summary)
 
 
 def test_a_mode_that_the_server_may_not_take_is_named(
@@ -150,7 +150,8 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
 
 def test_a_robot_that_is_stopped_before_any_answer_says_so(place: Place) -> None:
     line = run_to_the_sources_end(opened(place, NO_SERVER + ODOM + BAG))
-    assert re.search(r"^\d+ records captured in \d+ chunks, [1-9]\d* chunks kept for later: there was no session", line)
+    said = r"^\d+ records captured in \d+ chunks, [1-9]\d* chunks not yet at the server: there was no session"
+    assert re.search(said, line)
 
 
 def test_the_sum_counts_what_was_left_out(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""`status` shows what is there, names robots, and says what it cannot know; it makes nothing. `check` finds a chunk."""
+"""`status` shows what is there, names robots, and says what it cannot know; it makes nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.registry import Registry
 from rosbridge_eth.robot import open_robot
-from rosbridge_eth.status import Located, locate, span
+from rosbridge_eth.status import span
 from rosbridge_eth.supervisor import open_submitter
 
 TK = robot_id("robot_1")
@@ -357,64 +357,43 @@ def test_a_span_is_short(seconds: float | None, says: str):
     assert span(seconds) == says
 
 
-# check
+# of one robot
 
 
-def test_a_chunk_is_found_where_it_is_stored_written_confirmed_dead_or_nowhere(
-    place: Place, write: Callable[..., None], capsys: Capture
-):
-    def find(number: int, stream: bytes = STREAM) -> Located:
-        return locate(place.operator, place.ledger, "robot_1", stream.hex(), number)
-
-    chunks = [*chunk_chain(6)]
-    assert find(0) == Located("unknown")
-    inbox = place.inbox()
-    inbox.append([(TK, chunk) for chunk in chunks], time.time())
-    assert find(0) == find(5) == Located("stored")
-    assert find(6) == find(0, b"t" * 16) == Located("unknown")
-    write(*chunks[:2])
-    write(*chunks[2:4])
-    block = place.ledger.block_number()
-    events = [*place.ledger.data_events(TK, 0, block)]
-    assert find(1) == Located("confirmed", "0x" + events[0].transaction.hex(), block - 1, True)
-    assert find(2) == Located("confirmed", "0x" + events[1].transaction.hex(), block, True)
-    assert find(4) == Located("stored")
-    place.configure("\n[chain]", "\n[chain]\nconfirmations = 2")
-    assert (find(1).state, find(2).state) == ("confirmed", "written")
-    inbox.bury(TK, inbox.find(TK, place.ledger.standings([TK])[0].tail), "given up")
-    assert find(4) == Located("dead letter")
-    inbox.close()
-    for file in place.path.glob("operator/inbox.sqlite*"):
-        file.unlink()
-    assert find(2).state == "written", "the chain alone is enough"
-    assert find(4) == Located("unknown")
-
-
-def test_the_dropped_form_of_a_chunk_is_that_chunk(place: Place, write: Callable[..., None]):
-    first, second = chunk_chain(2)
-    write(dropped(first), second)
-    assert locate(place.operator, place.ledger, "robot_1", STREAM.hex(), 0).proven is True
-
-
-def test_a_chunk_is_asked_for_by_a_name_that_is_enrolled_and_a_stream_that_is_one(
+def test_of_one_robot_it_is_said_how_far_its_log_is_written_and_confirmed(
     place: Place, on_chain: None, write: Callable[..., None], capsys: Capture
 ):
-    def check(*arguments: str) -> int:
-        return run(["check", *arguments])
+    def log() -> dict[str, Any]:
+        assert run(["status", "robot_1", "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert list(report["robots"]) == ["robot_1"]
+        return report["robots"]["robot_1"]["log"]
 
-    assert check("robot_9", STREAM.hex(), "1") == ExitCode.IDENTITY
+    assert log() == {"written": None, "confirmed": None}
+    chunks = [*chunk_chain(6)]
+    write(*chunks[:2])
+    write(dropped(chunks[2]), chunks[3])
+    block = place.ledger.block_number()
+    first, second = (
+        {"stream": STREAM.hex(), "number": number, "block": event.block, "transaction": "0x" + event.transaction.hex()}
+        for number, event in zip((1, 3), place.ledger.data_events(TK, 0, block), strict=True)
+    )
+    assert log() == {"written": second, "confirmed": second}
+    place.configure("\n[chain]", "\n[chain]\nconfirmations = 2")
+    assert log() == {"written": second, "confirmed": first}
+    assert run(["status", "robot_1"]) == 0
+    said = capsys.readouterr().out
+    assert f"robot_1: confirmed up to chunk 1 of stream {STREAM.hex()}, in block {block - 1}" in said
+    for file in place.path.glob("operator/inbox.sqlite*"):
+        file.unlink()
+    assert log()["written"] == second, "the chain alone is enough"
+
+
+def test_a_name_that_is_not_enrolled_is_told(place: Place, on_chain: None, capsys: Capture):
+    assert run(["status", "robot_9"]) == ExitCode.IDENTITY
     assert "no robot 'robot_9' is enrolled; `status` lists" in capsys.readouterr().err
-    for wrong in ("zz", "0f" * 15, "0f" * 17, "0f " * 16, "é" * 32):
-        assert check("robot_1", wrong, "1") == ExitCode.CONFIG
-        assert "the stream is 32 hex digits" in capsys.readouterr().err
-    assert check("robot_1", STREAM.hex(), "0") == ExitCode.VERIFICATION
-    assert capsys.readouterr().out == "unknown\n"
-    write(*chunk_chain(1))
-    assert check("robot_1", STREAM.hex(), "0") == 0
-    assert "the contract says true" in capsys.readouterr().out
-    assert check("robot_1", STREAM.hex().upper(), "0", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["state"] == "confirmed" and found["proven"] is True and found["transaction"].startswith("0x")
+    assert run(["status", "robot_1", "--home", "robot"]) == ExitCode.CONFIG
+    assert "home of one robot" in capsys.readouterr().err
 
 
 def test_status_may_be_imported_by_itself():

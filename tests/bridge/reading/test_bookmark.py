@@ -100,7 +100,7 @@ def test_a_last_chunk_that_the_contract_has_another_hash_of_is_told_when_nothing
     chunks = Pen().chunks(3)
     first = read(chunks)
     stands = standing(events(chunks), [registration()])._replace(tail=b"x" * 32)
-    assert read(data=[], stands=stands, **first.at).only(Kind.ALTERED).first == 2
+    assert read(data=[], stands=stands, **first.at).only(Kind.ALTERED).places[0][0] == 2
 
 
 @pytest.mark.parametrize("broken", [b"junk", None])

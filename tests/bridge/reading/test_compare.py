@@ -11,8 +11,10 @@ import numpy
 import pytest
 from rosbags.rosbag1 import Writer
 
+from bridge.image_bags import CAMERA, CLOUD, IMAGES, JPEG, STORE, bag_of_images
 from rosbridge_eth.capture import Capture, MessageLine, RawMessage, TopicRule, Wire, decoder_for, parse_line
 from rosbridge_eth.reading.compare import MAX_DIFFERENCES, Comparison, compare, time_of
+from rosbridge_eth.sources import BagSource, Selection
 
 T0, STEP = 1_763_690_000_000_000_000, 100_000_000
 DEFINITION = "int64 n\nfloat32 f\nuint8[] raw\nstring[] names\ntime at\nbool from\nbyte b\n"
@@ -129,6 +131,55 @@ def test_elements_of_arrays_are_held_against_the_message_whatever_number_they_ar
     assert said.endswith("ranges[0] is 0.5 instead of 0.10000000149011612")
 
 
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("late_ns", [0, 3_000_000, -3_000_000])
+def test_a_bag_that_does_not_span_the_log(tmp_path, same, late_ns):
+    """The robot wrote 8 s; the recording has 2.0 to 5.9 s of them."""
+    written = messages(80, same=same)
+    path = bag(tmp_path / "my.bag", written[20:60])
+    made = compare(path, ["/t"], records(written, late_ns))
+    assert (told(made), made.differences) == ((40, 0), [])
+    for twice in (20, 40, 59):
+        doubled = [*written[: twice + 1], *written[twice:]]
+        assert told(compare(path, ["/t"], records(doubled, late_ns))) == (40, 1), twice
+    for gone in (20, 40, 59):
+        short = [*written[:gone], *written[gone + 1 :]]
+        made = compare(path, ["/t"], records(short, late_ns))
+        # Where all messages are alike, a record from beside the recording may stand for the one that is missing.
+        assert told(made) == (39, 1) or (same and told(made) == (40, 0)), (gone, made.differences)
+
+
+@pytest.mark.parametrize("same", [False, True])
+@pytest.mark.parametrize("late_ns", [433_333_000, -433_333_000])
+def test_a_bag_within_the_log_by_a_clock_of_its_own(tmp_path, same, late_ns):
+    """As above, and the recorder's clock differs from the robot's by more than a message's time."""
+    written = messages(80, same=same)
+    path = bag(tmp_path / "my.bag", written[20:60])
+    made = compare(path, ["/t"], records(written, late_ns))
+    assert (told(made), made.differences) == ((40, 0), [])
+    if not same:
+        for at in (20, 21, 40, 58, 59):
+            found = list(records(written, late_ns))
+            found[at] = found[at]._replace(data=found[at].data | {"f": 0.25})
+            made = compare(path, ["/t"], found)
+            assert made.equal == 39 and made.wrong, at
+            assert compare(path, ["/t"], found[:20] + found[60:]).wrong, "none of the messages has a record"
+
+
+def test_a_record_beside_a_replay_is_a_difference_at_the_ends_too(tmp_path):
+    written = messages(50)
+    path = bag(tmp_path / "my.bag", written[1:49:2])
+    for at in (2, 46):
+        found = records(sorted([*written[1:49:2], written[at]], key=lambda raw: raw.received_ns))
+        assert told(compare(path, ["/t"], found)) == (24, 1), at
+
+
+def test_a_short_bag_of_which_nothing_is_on_the_chain(tmp_path):
+    written = messages(5)
+    found = [one._replace(data=one.data | {"f": 0.25}) for one in records(written, 3_000_000)]
+    assert compare(bag(tmp_path / "my.bag", written), [], found).wrong
+
+
 def test_records_in_another_order(tmp_path):
     written = messages(50)
     found = list(records(written))
@@ -144,7 +195,7 @@ def test_a_topic_that_is_not_on_the_chain_is_a_difference_where_it_is_asked_for(
     assert (told(made), made.absent) == ((20, 0), ["/u"])
     made = compare(path, ["/t", "/u"], records(here))
     assert told(made) == (20, 1)
-    assert "any of the 20 messages on this topic" in made.differences[0]
+    assert "any of this topic's messages; the bag has 20" in made.differences[0]
 
 
 def test_records_of_other_topics_and_other_times_are_not_looked_at(tmp_path):
@@ -181,3 +232,28 @@ def test_memory_holds_two_seconds_of_a_bag(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < sum(len(raw.raw) for raw in written) / 3
     finally:
         tracemalloc.stop()
+
+
+def test_images_and_clouds_that_a_recorder_kept_are_proven_by_the_digests_in_the_log(tmp_path):
+    """What is above 16 KiB is in the log as its SM3; `rosbag record` beside the robot keeps the bytes."""
+    kept = tmp_path / "kept.bag"
+    bag_of_images(kept)
+    captured = list(BagSource(kept, Selection(["**"])).messages())
+    found = list(records(captured))
+    for topic, field in ((CAMERA, "data"), (JPEG, "data"), (CLOUD, "data")):
+        assert all(one.data[field].keys() == {"sm3", "length"} for one in found if one.topic == topic)
+    assert told(compare(kept, [], iter(found))) == (3 * IMAGES + IMAGES // 3, 0)
+
+    [image] = [n for n, raw in enumerate(captured) if raw.topic == CAMERA][7:8]
+    spoilt = captured[image].raw[:-1] + bytes([captured[image].raw[-1] ^ 1])  # one pixel
+    captured[image] = captured[image]._replace(raw=spoilt)
+    other = tmp_path / "other.bag"
+    with Writer(other) as writer:
+        to: dict[str, Any] = {}
+        for raw in captured:
+            if raw.topic not in to:
+                to[raw.topic] = writer.add_connection(raw.topic, raw.type_name, typestore=STORE)
+            writer.write(to[raw.topic], raw.received_ns, raw.raw)
+    made = compare(other, [], iter(found))
+    assert told(made) == (3 * IMAGES + IMAGES // 3 - 1, 1)
+    assert CAMERA in made.differences[0] and "data" in made.differences[0]

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from eth_hash.auto import keccak
 
 from bridge.browser import Browser
 from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, record
-from bridge.reading.test_evidence import rehung, start
-from bridge.reading.world import message, robot
+from bridge.reading.test_evidence import start
+from bridge.reading.world import message
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import create_ca
 from rosbridge_eth.ledger import Ledger
@@ -65,7 +66,7 @@ def test_it_checks_itself_and_shows_the_record_and_what_it_proves(browser: Brows
         assert line in said
     assert "What it does not prove" in said and "there are no other records" in said
     assert grouped(found.authorities[0]) in said and found.contract in said and found.genesis in said
-    assert all(f"0x{block.hash.hex()}" in said for block in found.blocks)
+    assert all(f"0x{each.written.transaction.hex()}" in said for each in found.records)
     assert "2026-11-22T10:06:45.000Z" in said and "pose.pose.position.x" in said
     assert str(found.records[0].content.data["pose"]["pose"]["position"]["x"]) in said
     assert "✗" not in said and browser.said == []
@@ -118,11 +119,10 @@ ALTERED: dict[str, Callable[[dict[str, Any]], Any]] = {
     "contract": lambda e: e.update(contract="11" * 20),
     "chain": lambda e: e.update(chain_id=1),
     "CA": lambda e: e.update(authorities=[create_ca("CA", at=ROOTS[0].not_before).certificate.to_der().hex()]),
-    "block header": lambda e: e["blocks"][0].update(header=e["blocks"][0]["header"].replace("f9", "f8", 1)),
-    "hash of a block": lambda e: e["blocks"][-1].update(hash="00" * 32),
-    "receipt's proof": lambda e: e["nodes"].__setitem__(0, e["nodes"][0][:-8] + "12345678"),
-    "storage's proof": lambda e: e["nodes"].pop(),
-    "receipts shown": lambda e: e["blocks"][0].update(receipts=[]),
+    "certificate": lambda e: e["certificates"].__setitem__(0, e["certificates"][0][:-8] + "12345678"),
+    "chunk": lambda e: e["chunks"][0].update(encoded=e["chunks"][0]["encoded"][:-8] + "12345678"),
+    "hash of the chunk": lambda e: e["chunks"][0].update(hashes=["00" * 32]),
+    "transaction": lambda e: e["chunks"][0].update(transaction="00"),
 }
 
 
@@ -142,21 +142,17 @@ def test_an_altered_file_is_shown_to_fail_and_nothing_of_it_is_shown(
     assert "pose.pose.position" not in said and "What this proves" not in said
 
 
-@pytest.mark.parametrize("what", ["root", "signature", "certificate"])
-def test_what_is_altered_within_an_event_is_shown_to_fail(what: str, browser: Browser, one: Evidence, tmp_path: Path):
-    """With every hash above it made anew, as somebody would who can invent blocks."""
-    text = one.encode()
-    root = verify(one, ROOTS, lambda line: None).records[0].header.root.hex()
-    begin = next(node.hex() for node in one.nodes if root in node.hex())
-    signature = begin[begin.index(root) + 64 + 8 + 64 + 2 + 121 * 2 :][:128]
-    certificate, name = robot().signing_certificate.to_der().hex(), b"urn:rosbridge-eth:robot:robot_1".hex()
-    old, new = {
-        "root": (root, "00" * 32), "signature": (signature, "11" * 64),
-        "certificate": (certificate, certificate.replace(name, name[:-2] + "32")),
-    }[what]  # fmt: skip
-    altered = rehung(text, old, new)
-    show(browser, one.page().replace(text, altered), tmp_path)
-    assert altered != text and verdict(browser) == "bad"
+@pytest.mark.parametrize("what", ["root", "signature"])
+def test_what_is_altered_within_a_chunk_is_shown_to_fail(what: str, browser: Browser, one: Evidence, tmp_path: Path):
+    """With the hash of the batch made anew, as somebody would who can invent a batch."""
+    [written] = one.chunks
+    header = verify(one, ROOTS, lambda line: None).records[0].header
+    old = {"root": header.root, "signature": written.encoded[len(header.encoded) :][:64]}[what]
+    encoded = written.encoded.replace(old, b"\x11" * len(old))
+    hashes = [keccak(encoded) if hash_ == keccak(written.encoded) else hash_ for hash_ in written.hashes]
+    other = written.model_copy(update={"encoded": encoded, "hashes": hashes})
+    show(browser, one.model_copy(update={"chunks": [other]}).page(), tmp_path)
+    assert encoded != written.encoded and verdict(browser) == "bad"
 
 
 def choose(browser: Browser, input_: str, file: Path) -> None:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from eth_hash.auto import keccak
 
 from bridge.reading.world import NAME, START, Pen, authority, reader, robot
 from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust
-from rosbridge_eth.ledger import Keyring, Ledger, Standing
+from rosbridge_eth.ledger import DataEvent, Keyring, Ledger, Standing, contract
+from rosbridge_eth.ledger.contract import RegistrationEvent
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.ledger.transport import TooMuch
 from rosbridge_eth.reading import Bookmarks, Kind, Reading, read_robot
-from rosbridge_eth.reading.fetch import MARGIN
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")
 OPERATOR, ACCOUNT = KEYS.operator, KEYS.robot(1)
@@ -169,7 +171,7 @@ class Node:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._ledger, name)
 
-    def standings(self, tks: Sequence[bytes], block: int) -> list[Standing]:
+    def standings(self, tks: Sequence[bytes], block: int | str = "latest") -> list[Standing]:
         return [one._replace(**self._standing) for one in self._ledger.standings(tks, block)]
 
 
@@ -178,17 +180,113 @@ class Dead(Node):
         raise ChainError(f"{self.url} does not answer: \x1b[2J")
 
 
+CHANGED = [
+    {"account": KEYS.robot(5).address}, {"certificates_hash": b"x" * 32}, {"revoked": True}, {"chunks": 2},
+    {"chunks": 10**18}, {"tail": b"x" * 32}, {"data_block": 1}, {"account": None}, {"balance": 7},
+]  # fmt: skip
+
+
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_node_that_shows_most_is_read_and_the_others_are_told(chain, order):
+@pytest.mark.parametrize("lie", CHANGED, ids=str)
+def test_nodes_that_do_not_say_the_same_of_a_robot_are_told_and_nothing_is_sound(chain, lie, order, tmp_path):
+    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
     chain.write(chain.pen.chunks(3))
-    behind, other = Node(chain.ledger, "http://behind", chunks=2), Node(chain.ledger, "http://other", tail=b"x" * 32)
-    reading = chain.read(ledgers=[behind, chain.ledger][::order])
+    liar = Node(chain.ledger, "http://liar\x1b[2J", **lie)
+    reading = chain.read(ledgers=[chain.ledger, liar][::order], bookmarks=bookmarks)
+    numbers(reading)
+    verdict = reading.verdict()
+    assert not verdict.sound and verdict.counts["contradicted"] >= 1
+    [name] = lie
+    told = "\n".join(verdict.lines())
+    assert f"has another {name}: " in told and "\x1b" not in told
+    reading.keep(bookmarks)
+    assert bookmarks.get(chain.pen.log) is None, "what nodes do not agree on is not what later readings are held to"
+    assert chain.read(Node(chain.ledger, "http://other")).verdict().sound
+
+
+def test_a_node_that_hides_a_revocation_is_told_beside_an_honest_one(chain):
+    """Its chunks behind it would be those of who has the stolen key."""
+    tk = chain.pen.log.tk
+    chain.write(chain.pen.chunks(2))
+    chain.ledger.revoke_robot(OPERATOR, tk)
+    [stands] = chain.ledger.standings([tk])
+    stolen = [chunk.encoded for chunk in chain.pen.chunks(2)]
+
+    class Hiding(Node):
+        def registrations(self, tk: bytes, standing: Any) -> Any:
+            return [event for event in self._ledger.registrations(tk, stands) if not event.revoked]
+
+        def data_events(self, tk: bytes, first: int, last: int) -> Any:
+            yield from self._ledger.data_events(tk, first, last)
+            yield DataEvent(2, stands.data_block, tuple(stolen), last, b"t" * 32, ACCOUNT.address)
+
+    changed = Node(chain.ledger, "").registrations(tk, stands)[0].block
+    liar = Hiding(
+        chain.ledger, "http://liar", revoked=False, chunks=4, tail=keccak(stolen[-1]), changed_block=changed,
+        data_block=chain.ledger.block_number(),
+    )  # fmt: skip
+    alone = chain.read(ledgers=[liar])
+    assert numbers(alone) == [0, 1, 2, 3] and alone.verdict().sound, "one node alone is believed"
+    for ledgers in ([liar, chain.ledger], [chain.ledger, liar]):
+        reading = chain.read(ledgers=ledgers)
+        numbers(reading)
+        assert violations(reading) and "contradicted" in violations(reading)
+
+
+def test_a_replacement_in_the_middle_that_one_node_hides_is_told(chain):
+    tk = chain.pen.log.tk
+    for number in (1, 2):
+        chain.ledger.replace_registration(OPERATOR, tk, KEYS.robot(9).address, robot(number).public.certificates)
+
+    class Hiding(Node):
+        def registrations(self, tk: bytes, standing: Any) -> Any:
+            first, _, last = self._ledger.registrations(tk, standing)
+            return [first, replace(last, previous_block=first.block)]
+
+    liar = Hiding(chain.ledger, "http://liar")
+    assert chain.read(ledgers=[liar]).verdict().sound
+    assert violations(chain.read(liar)) == ["contradicted"]
+
+
+class Behind(Node):
+    """Has so many blocks less; what it cannot show is `missing`."""
+
+    def __init__(self, ledger: Ledger, blocks: int) -> None:
+        super().__init__(ledger, "http://behind")
+        self._blocks = blocks
+
+    def block_number(self) -> int:
+        return self._ledger.block_number() - self._blocks
+
+
+def test_all_nodes_are_read_up_to_the_block_that_the_last_of_them_has(chain):
+    for _ in range(3):
+        chain.write(chain.pen.chunks(1))
+    for ledgers in ([chain.ledger, Behind(chain.ledger, 1)], [Behind(chain.ledger, 1), chain.ledger]):
+        reading = chain.read(ledgers=ledgers)
+        assert numbers(reading) == [0, 1]
+        assert reading.verdict().sound and not reading.verdict().nodes
+    chain.where.ethereum_tester.mine_blocks(20)
+    reading = chain.read(Behind(chain.ledger, 20))
     assert numbers(reading) == [0, 1, 2]
-    [told] = reading.verdict().nodes
-    assert told.startswith("node http://behind shows 2 chunks only")
-    reading = chain.read(ledgers=[chain.ledger, other])
-    assert "the nodes contradict" in reading.verdict().nodes[0]
-    assert reading.verdict().nodes[0] in "\n".join(reading.verdict().lines())
+    assert reading.verdict().nodes == ("node http://behind is 20 blocks behind; all are read up to what it has",)
+
+
+def test_a_node_that_cannot_show_the_block_in_which_all_are_compared_is_no_agreement(chain):
+    """So a liar cannot silence a node without old states by naming an old block."""
+
+    class Pruned(Node):
+        def standings(self, tks: Sequence[bytes], block: int) -> Any:
+            raise ChainError("missing trie node")
+
+    chain.write(chain.pen.chunks(1))
+    chain.where.ethereum_tester.mine_blocks(20)
+    with pytest.raises(ChainError, match="missing trie node; node http://behind is 20 blocks behind"):
+        chain.read(ledgers=[Pruned(chain.ledger, "http://pruned"), Behind(chain.ledger, 20)])
+    for other in (Pruned(chain.ledger, "http://pruned"), Node(chain.ledger, "http://pruned", changed_block=1)):
+        reading = chain.read(other)
+        assert numbers(reading) == [0] and violations(reading) == ["contradicted"]
+    assert "http://pruned does not answer for block" in "\n".join(reading.verdict().lines())
 
 
 def test_a_node_that_does_not_answer_is_told_and_a_dead_chain_is_an_error(chain):
@@ -226,22 +324,100 @@ def test_a_bookmark_is_not_moved_by_a_node_that_rolled_back(chain, tmp_path: Pat
     assert mark.count == 3
 
 
-def test_what_is_deep_in_a_real_chain_is_kept_and_the_rest_is_asked_for(chain, tmp_path, monkeypatch):
-    chain.write(chain.pen.chunks(3, records=5))
-    chain.where.ethereum_tester.mine_blocks(MARGIN)
-    chain.write(chain.pen.chunks(2, records=5))
+# --- confirmations, and what was read before
+
+
+@pytest.mark.parametrize("confirmations", [1, 2, 3])
+def test_a_node_that_counts_more_chunks_in_its_newest_block_has_to_show_them(chain, tmp_path, confirmations):
+    """It shows an old state where it is read, and says that the rest stands above."""
+    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
+    for _ in range(4):
+        chain.write(chain.pen.chunks(1))
+    reading = chain.read(bookmarks=bookmarks)
+    numbers(reading)
+    reading.keep(bookmarks)
+    top = chain.ledger.block_number()
+    other = chain.pen.chunks(1)[0].encoded
+
+    class Old(Node):
+        def standings(self, tks: Sequence[bytes], block: int | str = "latest") -> list[Standing]:
+            shown = self._ledger.standings(tks, "latest" if block == "latest" else min(block, top - 3))
+            return [one._replace(**self._standing) for one in shown] if block == "latest" else shown
+
+        def newest_data(self, tk: bytes, last: int) -> Any:
+            return self.shows(tk, last)
+
+    chain.where.ethereum_tester.mine_blocks(4)
+    for chunks, shows in (
+        (10**6, lambda tk, last: iter([])),
+        (4, lambda tk, last: iter([DataEvent(3, top, (other,), last, b"", "")])),
+        (4, lambda tk, last: iter([DataEvent(3, top, (), last, b"", "")])),
+    ):
+        node = Old(chain.ledger, "http://old", chunks=chunks)
+        node.shows = shows
+        reading = chain.read(ledgers=[node], bookmarks=bookmarks, confirmations=confirmations)
+        assert numbers(reading) == [0]
+        assert "rolled-back" in violations(reading)
+
+
+# --- a node that would hold a reader
+
+
+@pytest.mark.parametrize("block", [2**60, 2**40])
+def test_no_block_above_the_one_that_is_read_is_taken(chain, monkeypatch, block):
+    chain.write(chain.pen.chunks(1))
+    real = contract._standing
+    for position in (6, 7):
+        def standing(row: Any, *more: Any, position: int = position) -> Any:
+            return real((*row[:position], block, *row[position + 1 :]), *more)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(contract, "_standing", standing)
+            with pytest.raises(ChainError, match="where a number was expected"):
+                chain.read()
+        with monkeypatch.context() as patched:
+            patched.setattr(contract, "_standing", standing)
+            with pytest.raises(ChainError, match="where a number was expected"):
+                chain.ledger.standings([chain.pen.log.tk])
+
+
+def test_registrations_without_end_are_refused(chain, monkeypatch):
+    """Each block says that the one before it has another."""
     asked: list[int] = []
-    real = Ledger.data_events
 
-    def data_events(self: Ledger, tk: bytes, first_block: int, last_block: int) -> Iterator[Any]:
-        asked.append(last_block - first_block)
-        return real(self, tk, first_block, last_block)
+    [stands] = chain.ledger.standings([chain.pen.log.tk])
+    for size, most in ((10, contract.MAX_REGISTRATIONS + 1), (2**20, 17)):
+        asked.clear()
 
-    monkeypatch.setattr(Ledger, "data_events", data_events)
-    for _ in range(2):
-        reading = chain.read(cache=tmp_path / "proven")
-        assert numbers(reading) == list(range(25))
-        assert reading.verdict().sound
-        assert (reading.verdict().records, reading.verdict().chunks) == (25, 5)
-        reading.close()
-    assert asked[0] > MARGIN > asked[1]
+        def events(self: Ledger, makers: Any, tk: bytes, start: int, end: int, size: int = size) -> Any:
+            asked.append(start)
+            return [RegistrationEvent(ACCOUNT.address, bytes(size), 0, start - 1, start, False)]
+
+        monkeypatch.setattr(Ledger, "_events", events)
+        with pytest.raises(ChainError, match="more than 1,000 registrations"):
+            chain.ledger.registrations(chain.pen.log.tk, stands._replace(changed_block=10**6))
+        assert len(asked) == most
+
+
+def test_blocks_without_batches_cost_few_requests_however_many_a_node_shows(chain, monkeypatch):
+    asked: list[int] = []
+
+    def data(self: Ledger, tk: bytes, start: int, end: int) -> Any:
+        asked.append(end - start + 1)
+        if end - start >= most:
+            raise TooMuch("ranges of so many blocks only")
+        return []
+
+    monkeypatch.setattr(Ledger, "_data", data)
+    most = contract.MAX_BLOCK
+    assert list(chain.ledger.data_events(chain.pen.log.tk, 1, contract.MAX_BLOCK - 1)) == []
+    assert len(asked) < 30 and sum(asked) == contract.MAX_BLOCK - 1
+    asked.clear()
+    most = 5_000
+    assert list(chain.ledger.data_events(chain.pen.log.tk, 1, 10**6)) == []
+    assert len(asked) < 10**6 / 4_000 + 10, "what a node refuses is not asked for again and again"
+    asked.clear()
+    monkeypatch.setattr(Ledger, "_data", lambda self, tk, start, end: data(self, tk, start, end) if start < 100 else [])
+    most = 1
+    assert list(chain.ledger.data_events(chain.pen.log.tk, 1, 10**6)) == []
+    assert len(asked) < 300, "blocks that are too full for more than one at once do not slow down what is behind"

@@ -10,13 +10,12 @@ from typing import Any
 import pytest
 
 from bridge.reading.test_fetch import ACCOUNT, ETH, KEYS, NOW, OPERATOR, Chain, Node, chain
-from bridge.reading.world import NAME, Pen, authority, message, reader, robot
+from bridge.reading.world import NAME, Pen, authority, reader, robot
 from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, IdentityError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.reading import Bookmark, Bookmarks, Choice, read_robot
-from rosbridge_eth.reading.fetch import MARGIN
 from rosbridge_eth.reading.follow import Followed, Following
 
 __all__ = ["chain"]
@@ -29,7 +28,7 @@ class Follow:
         self.bookmarks = Bookmarks(folder / "bookmarks.json")
         read = partial(
             read_robot, ledgers, trust=Trust([authority().certificate]), reader=reader().encryption_key,
-            bookmarks=self.bookmarks, cache=folder / "proven", **more,
+            bookmarks=self.bookmarks, memo=folder / "proven", **more,
         )  # fmt: skip
         self.robots = [Followed(name, read, self.bookmarks) for name in names]
         self.following = Following(self.robots, ledgers)
@@ -174,55 +173,6 @@ def test_what_is_behind_withheld_chunks_is_given_after_them(chain: Chain, tmp_pa
     assert follow.verdict.sound
 
 
-def test_a_body_that_is_not_in_the_archive_holds_nothing_up(chain: Chain, tmp_path: Path):
-    bodies = dict[bytes, bytes]()
-    node = Flaky(chain.ledger, "http://flaky")
-
-    def archive(digest: bytes, length: int) -> bytes | None:
-        return bodies.get(digest)
-
-    follow = Follow(tmp_path, node, bodies=archive)
-    first, archived = chain.pen.chunks(1), chain.pen.write(message(1), archived=True)
-    chain.write([*first, archived.on_chain, *chain.pen.chunks(1)])
-    assert follow.look() == [0, 2] and follow.verdict.counts["withheld"] == 1
-    for n in (3, 4):
-        chain.write(chain.pen.chunks(1))
-        node.fails_after = 1  # of the events that are asked for: the new one alone
-        assert follow.look() == [n] and not follow.robots[0].trouble
-    assert follow.verdict.counts["withheld"] == 1 and not follow.verdict.sound
-    bodies[archived.header.body_digest] = archived.body
-    assert Follow(tmp_path, chain.ledger, bodies=archive).look() == [0, 1, 2, 3, 4]
-
-
-def test_what_becomes_final_meanwhile_is_kept_and_nothing_is_given_twice(chain: Chain, tmp_path: Path):
-    follow, given = Follow(tmp_path, chain.ledger), []
-    for _ in range(5):
-        chain.write(chain.pen.chunks(2))
-        given += follow.look()
-        chain.where.ethereum_tester.mine_blocks(MARGIN // 2)
-    assert given == list(range(10))
-    [file] = (tmp_path / "proven").iterdir()
-    size = file.stat().st_size
-    later = chain.read(cache=tmp_path / "proven")
-    assert later.kept is not None and later.kept.progress.count >= 4 and size > 4_000
-    later.close()
-    assert Follow(tmp_path, chain.ledger).look() == list(range(10)), "a new one begins with what is kept"
-
-
-def test_what_another_command_read_and_kept_meanwhile_is_given(chain: Chain, tmp_path: Path):
-    node = Flaky(chain.ledger, "http://flaky")
-    follow = Follow(tmp_path, node)
-    chain.write(chain.pen.chunks(2))
-    assert follow.look() == [0, 1]
-    node.away = True
-    follow.look()
-    chain.write(chain.pen.chunks(2))
-    chain.where.ethereum_tester.mine_blocks(MARGIN + 1)
-    other = chain.read(cache=tmp_path / "proven")
-    assert len(list(other.records())) == 4
-    other.close()
-    node.away = False
-    assert follow.look() == [2, 3]
 
 
 def test_a_bookmark_that_another_command_moved_is_not_moved_back(chain: Chain, tmp_path: Path):

@@ -17,7 +17,6 @@ from rosbridge_eth.chunk import NoGrant
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.reading import Choice, Reading, read_robot
-from rosbridge_eth.reading.fetch import MARGIN
 from rosbridge_eth.reading.grant import Keys, keys_of, make, open_folder, open_grant
 
 __all__ = ["chain"]
@@ -63,18 +62,17 @@ def test_a_grant_opens_the_chunks_of_its_span_and_no_other(chain: Chain):
         read(chain, granted=keys).verifier.key_of(chain.pen.write(b"{}").header)
 
 
-def test_what_was_kept_without_a_grant_is_read_anew_with_it(chain: Chain, tmp_path: Path):
+def test_a_grant_opens_what_was_read_without_it_and_closes_it_when_it_is_removed(chain: Chain, tmp_path: Path):
     chain.write(chain.pen.chunks(10, records=2))
-    chain.where.ethereum_tester.mine_blocks(MARGIN + 1)
     keys = Keys()
-    for granted, given in (({}, []), (keys, [*range(4, 12)]), (keys, [*range(4, 12)])):
-        reading = read(chain, cache=tmp_path / "proven", granted=granted)
+    for granted, given in (({}, []), (keys, [*range(4, 12)]), (keys, [*range(4, 12)]), ({}, [])):
+        reading = read(chain, memo=tmp_path / "proven", granted=granted)
         assert numbers(reading) == given
         assert reading.verdict().sound and reading.verdict().chunks == 10
         reading.close()
         if not keys:  # of a reader that has all of it kept
             for _ in range(2):
-                keys |= span(chain, cache=tmp_path / "owner")
+                keys |= span(chain, memo=tmp_path / "owner")
 
 
 def test_who_was_granted_may_grant_on(chain: Chain):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from bridge.reading.certificates import CAS, cases
 from bridge.reading.world import (
     NAME,
     START,
@@ -25,12 +26,14 @@ from bridge.reading.world import (
 )
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth.chunk import Log
+from rosbridge_eth import chunk
+from rosbridge_eth.chunk import Log, zstd
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.identity import Trust
+from rosbridge_eth.identity import CertificateAuthority, Trust
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.reading import Verdict, read_robot
+from rosbridge_eth.reading.outputs import json_line
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -68,7 +71,7 @@ class Written:
     pen: Pen
 
     def write(self, *chunks: Any) -> None:
-        encoded = [chunk if isinstance(chunk, bytes) else chunk.on_chain.encoded for chunk in chunks]
+        encoded = [chunk if isinstance(chunk, bytes) else chunk.encoded for chunk in chunks]
         self.ledger.set_data(KEYS.robot(1), self.pen.log.tk, encoded)
 
 
@@ -91,32 +94,27 @@ class Both:
 
 
 def both(
-    chain: Written, verifier: list[str], tmp_path: Path, key: bool = True, archive: Path | None = None
-) -> Both:
-    def body(digest: bytes, length: int) -> bytes | None:
-        file = (archive or tmp_path) / digest.hex()[:2] / digest.hex()
-        return file.read_bytes() if file.exists() else None
-
+    chain: Written, verifier: list[str], tmp_path: Path, key: bool = True,
+    cas: Sequence[CertificateAuthority] = (authority(),),
+) -> Both:  # fmt: skip
     reading = read_robot(
-        [chain.ledger], NAME, trust=Trust([authority().certificate]), now=START.timestamp(),
-        reader=reader().encryption_key if key else None, bodies=body if archive else None,
+        [chain.ledger], NAME, trust=Trust([one.certificate for one in cas]), now=START.timestamp(),
+        reader=reader().encryption_key if key else None,
     )  # fmt: skip
-    mine = [(record.line, record.place.chunk, record.number) for record in reading.records()]
+    mine = [json.loads(json_line(record)) for record in reading.records()]
     here = reading.verdict()
     ca = tmp_path / "ca.crt.pem"
-    ca.write_bytes(authority().certificate.to_pem())
+    ca.write_bytes(b"".join(one.certificate.to_pem() for one in cas))
     command = [*verifier, "--node", chain.ledger.url, "--contract", chain.ledger.contract]
     command += ["--robot", NAME, "--ca", str(ca)]
     command += ["--key", reader().encryption_key.to_bytes().hex()] if key else []
-    command += ["--archive", str(archive)] if archive else []
     done = subprocess.run(command, capture_output=True, timeout=120)
     assert done.returncode in (0, 9), done.stderr.decode()
     there = json.loads(done.stderr)
     records = []
-    for text, (mine_line, index, number) in zip(done.stdout.splitlines(), mine, strict=True):
+    for text, expected in zip(done.stdout.splitlines(), mine, strict=True):
         value = json.loads(text)
-        proof = value.pop("proof")
-        assert (value, proof["chunk"], proof["record"]) == (json.loads(mine_line), index, number)
+        assert value == expected and list(value["proof"]) == list(expected["proof"])
         records.append(value)
     assert (done.returncode == 0) == there["sound"] == here.sound
     assert (there["chunks"], there["records"]) == (here.chunks, here.records)
@@ -125,6 +123,7 @@ def both(
     assert [one["fingerprint"] for one in there["certificates"] if not one["revoked"]] == [
         one.fingerprint for one in here.certificates if not one.revoked
     ]
+    assert [one["trusted"] for one in there["certificates"]] == [one.key is not None for one in here.certificates]
     return Both(here, there, records)
 
 
@@ -168,23 +167,6 @@ def test_without_a_key(chain, verifier, tmp_path):
     assert both(chain, verifier, tmp_path, key=False).there["counts"] == {"no-grant": 6}
 
 
-def test_an_archive(chain, verifier, tmp_path):
-    pen = chain.pen
-    chunks = [pen.write(message(n, image=100_000 * "QUJD"), archived=True) for n in range(4)]
-    dropped = pen.drop(pen.write(message(9), archived=True))
-    chain.write(*chunks, dropped, *pen.chunks(1, goodbye=True))
-    folder = tmp_path / "bodies"
-    for chunk, spoil in zip(chunks[:3], (b"", b"", b"x"), strict=True):
-        name = chunk.header.body_digest.hex()
-        (folder / name[:2]).mkdir(parents=True, exist_ok=True)
-        (folder / name[:2] / name).write_bytes(chunk.body + spoil)
-    read = both(chain, verifier, tmp_path, archive=folder)
-    assert read.there["counts"] == {"withheld": 2, "dropped": 1} and not read.there["sound"]
-    assert [record["data"]["x"] for record in read.records] == [0, 1, 5]
-    unseen = both(chain, verifier, tmp_path)
-    assert unseen.there["counts"] == {"archived": 4, "dropped": 1} and unseen.there["sound"]
-
-
 def test_what_is_wrong_is_called_by_the_same_name(chain, verifier, tmp_path):
     pen = chain.pen
     chunks = pen.chunks(8)
@@ -197,3 +179,81 @@ def test_what_is_wrong_is_called_by_the_same_name(chain, verifier, tmp_path):
     chain.write(foreign, other, Pen(log=pen.log, identity=robot(1)).write(message(1)))
     read = both(chain, verifier, tmp_path)
     assert set(read.there["counts"]) == {"malformed", "forged", "altered", "forked", "missing"}
+
+
+def test_certificates_are_judged_by_the_table_of_the_page(chain, verifier, tmp_path):
+    """The same cases as evidence in test_evidence.py."""
+    known = list(cases())
+    for number, case in enumerate(known, 20):
+        account = KEYS.robot(number).address
+        chain.ledger.replace_registration(KEYS.operator, chain.pen.log.tk, account, case.registered)
+    read = both(chain, verifier, tmp_path, cas=CAS)
+    judged = dict(zip((case.name for case in known), read.here.certificates[1:], strict=True))
+    assert [name for name, one in judged.items() if one.key] == [case.name for case in known if case.good]
+
+
+def streamed(content: bytes, **options: int) -> bytes:
+    packing = zstd.ZstdCompressor(options={int(getattr(zstd.CompressionParameter, k)): v for k, v in options.items()})
+    return packing.compress(content) + packing.flush()
+
+
+def test_frames_that_are_none_are_opened_by_neither(chain, verifier, tmp_path, monkeypatch):
+    good = message(1), message(2)
+    content = b"\n".join([*good, b""])
+    checked = streamed(content, checksum_flag=1)
+    dictionary = zstd.train_dict([message(n, topic=f"/t{n % 7}") for n in range(2_000)], 4096)
+    foreign = zstd.compress(content, zstd_dict=dictionary)
+    long = message(1, text="x" * 70_000), message(2)
+    frames = {
+        "good": streamed(content), "window of 4 MiB": streamed(content, window_log=22),
+        "window above it": streamed(content, window_log=23), "with a checksum": checked,
+        "a wrong checksum": checked[:-1] + bytes([checked[-1] ^ 1]), "a dictionary": foreign,
+        "an empty record in the middle": streamed(good[0] + b"\n\n" + good[1] + b"\n"),
+        "an empty record in front": streamed(b"\n" + content), "no end": streamed(content[:-1]),
+        "a bomb": streamed(content + b"a" * (5 << 20) + b"\n"), "another size": zstd.compress(content)[:5] + b"\x01"
+        + zstd.compress(content)[6:], "two frames": streamed(content) * 2, "a long line": None,
+    }  # fmt: skip
+    for frame in frames.values():
+        if frame is None:
+            chain.write(chain.pen.write(*long))
+            continue
+        with monkeypatch.context() as patched:
+            padded = frame.ljust(len(frame) + -len(frame) % 64, b"\0")
+            patched.setattr(chunk, "_pack", lambda *given, padded=padded: padded)
+            chain.write(chain.pen.write(*good))
+    read = both(chain, verifier, tmp_path)
+    assert read.there["counts"]["unopenable"] == read.here.counts["unopenable"] > 6
+    assert len(read.records) > 4
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_lines_in_another_form_are_told_by_both(chain, verifier, tmp_path, clock):
+    data = message(1, text="é\u2028", big=2**62, small=1e-300)
+    spoiled = [
+        data.replace(b",", b", ", 1), data.replace(b"/odom", b"\\u002fodom"), data.replace(b"/odom", b"\\/odom"),
+        data.replace(b'"x":1', b'"x":1,"x":2'), data.replace(b'"clock":true', b'"clock":1'), data + b" ", data[:-1],
+        data.replace(b'"received_ns":1', b'"received_ns":-1'), data.replace(b'"received_ns":1', b'"received_ns":1.0'),
+        data.replace(b'"received_ns":1', b'"received_ns":9223372036854775808'), data.replace(b'"x":1', b'"x":1e400'),
+        data.replace(b'"x":1', b'"x":NaN'), data.replace(b'"x":1', b'"x":' + b"[" * 120 + b"]" * 120),
+        data.replace(b'"x":1', b'"x":"\\ud800"'), data.replace(b'"x":1', b'"x":"\xff"'), message(1, text="x" * 62_000),
+        data.replace(b'"topic"', b'"topics"'), data.replace(b'"data":{', b'"more":1,"data":{'), b"[]", b"{}", b"1",
+        line({"source": "sim", "software": "s"}), line({"lost": -1, "topic": "/t", "why": "w"}),
+        line({"lost": 1, "topic": "/t"}), line({"type": "t", "wire": "ros1", "format": 1, "definition": "d"}),
+        line({"trigger": "t", "why": "w", "at_ns": 2**63}), b'{"stream":{"source":"sim","software":"s"},"x":1}',
+    ]
+    fine = [
+        data, message(2, clock=clock), line({"lost": 2**53, "topic": "/t", "why": 'a"b\n\x1b'}), STREAM_LINE,
+        data.replace(b'"x":1', b'"x":[1.50,-0,1E5,123456789012345678901234567890]'), message(3, lost=5, at_ns=-7),
+    ]
+    chain.write(chain.pen.write(*spoiled, *fine))
+    read = both(chain, verifier, tmp_path)
+    assert read.there["counts"]["unopenable"] == len(spoiled)
+    assert len(read.records) == 4
+
+
+def test_a_whole_chunk_behind_its_dropped_form(chain, verifier, tmp_path):
+    pen = chain.pen
+    one, two, three = pen.chunks(3, records=2)
+    chain.write(one, pen.drop(two), three, two, two)
+    read = both(chain, verifier, tmp_path)
+    assert read.there["counts"] == {"dropped": 2, "forked": 1} and len(read.records) == 6

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import struct
+import tracemalloc
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -38,7 +39,7 @@ from rosbridge_eth.reading.outputs import BagSummary
 from rosbridge_eth.reading.verify import Choice, Place, ProvenRecord
 
 T0 = 1_763_690_000_000_000_000
-PLACE = Place(7, b"s" * 16, 3, b"d" * 32, 9, T0 // 10**9 + 7, b"\xab" * 32)
+PLACE = Place(7, b"s" * 16, 3, b"d" * 32, 9, T0 // 10**9 + 7, b"\xab" * 32, T0 // 10**6)
 BAGS = ["out.bag", "out", "out.mcap", "out.db3"]
 EVIL = "/\x1b[2J\u202e"
 
@@ -116,8 +117,9 @@ def test_a_json_line_is_the_record_and_where_it_is_proven():
     assert text.count("\n") == 1
     assert (value["topic"], value["data"], value["received_ns"]) == ("/t", {"x": 0.5, "y": -1.5, "z": 0.0}, T0 + 3)
     assert value["proof"] == {
-        "chunk": 7, "record": 3, "stream": "73" * 16, "number": 3, "digest": "64" * 32, "block": 9,
-        "block_time": "2025-11-21T01:53:27.000Z", "transaction": "0x" + "ab" * 32,
+        "chunk": 7, "record": 3, "stream": "73" * 16, "number": 3, "digest": "64" * 32,
+        "sealed": "2025-11-21T01:53:20.000Z", "block": 9, "block_time": "2025-11-21T01:53:27.000Z",
+        "transaction": "0x" + "ab" * 32,
     }  # fmt: skip
 
 
@@ -156,6 +158,51 @@ def test_no_cell_is_taken_for_a_formula_or_acts_on_a_terminal(tmp_path):
     assert not any(cell.startswith(("=", "@", "+")) for cell in [*row, *row.values()])
     assert (row["topic"], row["n"], float(row["low"])) == ("'-topic", "-3", -math.inf)
     assert all(text.isprintable() for text in (tmp_path / "t.csv").read_text("utf-8").splitlines())
+
+
+@pytest.mark.parametrize("text", [
+    "=1", "+1", "-1+1", "@SUM(1)", " =1", "a;=1", "a; @x", "a,=1", "a|+1", "＝1", "＋1", "－1", "＠x", "a;＝cmd",
+    ";;-1",
+])  # fmt: skip
+def test_no_text_is_a_formula_at_its_beginning_or_behind_what_divides_cells_elsewhere(tmp_path, text):
+    with outputs.table(tmp_path / "t.csv") as table:
+        table.write(record(1, "pkg/msg/A", {"cell": text, text: 1}))
+    for delimiter in ",;|":
+        with (tmp_path / "t.csv").open(newline="", encoding="utf-8") as file:
+            cells = [cell for row in csv.reader(file, delimiter=delimiter) for cell in row]
+        assert not [cell for cell in cells if cell.lstrip()[:1] in {*"=+-@＝＋－＠"}]
+
+
+@pytest.mark.parametrize("text", ["a=1", "frame-id", "x@y", "1;2", "a - b", "'=1"])
+def test_text_that_is_no_formula_stays_as_it_is(tmp_path, text):
+    with outputs.table(tmp_path / "t.csv") as table:
+        table.write(record(1, "pkg/msg/A", {"cell": text}))
+    assert read_table(tmp_path / "t.csv")[0]["cell"] == text
+
+
+def test_numbers_that_some_records_have_stay_exact(tmp_path):
+    with outputs.table(tmp_path / "t.csv") as table:
+        for n, data in enumerate(({"stamp": T0 + 1, "on": True}, {"other": 0.1}, {"stamp": T0 + 3})):
+            table.write(record(n, "pkg/msg/A", data))
+    rows = read_table(tmp_path / "t.csv")
+    assert [row["stamp"] for row in rows] == [str(T0 + 1), "", str(T0 + 3)]
+    assert ([row["on"] for row in rows], [row["other"] for row in rows]) == (["True", "", ""], ["", "0.1", ""])
+    table = parquet(tmp_path / "t.parquet", [record(n, "pkg/msg/A", {"stamp": T0 + n} if n else {}) for n in range(3)])
+    assert table["stamp"].to_pylist() == [None, T0 + 1, T0 + 2]
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_a_table_takes_no_more_memory_for_more_rows(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(outputs, "_BATCH", 100)
+    highest = []
+    for count in (500, 4_000):
+        with outputs.table(tmp_path / f"{count}{name}") as table:
+            for n in range(count):
+                table.write(record(n, "pkg/msg/A", {"text": "x" * 1_000, "n": n}))
+            tracemalloc.start()
+        highest.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert highest[1] < 2 * highest[0] + 500_000
 
 
 def test_columns_are_bounded(tmp_path):
@@ -541,15 +588,16 @@ def test_a_parquet_file_has_numbers_times_and_lists(tmp_path, monkeypatch):
     table = parquet(tmp_path / "t.parquet", [*arms, point(9)])
     types = {field.name: str(field.type) for field in table.schema}
     assert types | {
-        "topic": "string", "received": "timestamp[ns, tz=UTC]", "captured": "timestamp[ns, tz=UTC]", "clock": "bool",
-        "stream": "string", "number": "uint64", "chunk": "int64", "block": "int64", "transaction": "string",
-        "header.stamp": "timestamp[ns, tz=UTC]", "header.frame_id": "string", "joints": "list<element: double>",
-        "ids": "list<element: int64>", "on": "bool", "n": "int64", "f": "double", "big": "string", "mixed": "string",
-        "empty": "list<element: int64>", "x": "double",
+        "topic": "string", "received_ns": "timestamp[ns, tz=UTC]", "captured_ns": "timestamp[ns, tz=UTC]",
+        "clock": "bool", "stream": "string", "number": "int64", "chunk": "int64", "block": "int64",
+        "transaction": "string",
+        "header.stamp": "int64", "header.frame_id": "string", "joints": "list<element: double>",
+        "ids": "list<element: double>", "on": "bool", "n": "int64", "f": "double", "big": "string", "mixed": "string",
+        "empty": "list<element: double>", "x": "double",
     } == types  # fmt: skip
-    rows = table.drop(["received", "captured", "header.stamp"]).to_pylist()
-    assert table["received"].cast("int64").to_pylist() == [T0, T0 + 1, T0 + 2, T0 + 3, T0 + 9]
-    assert table["header.stamp"].cast("int64").to_pylist() == [T0 + 7] * 4 + [None]
+    rows = table.drop(["received_ns", "captured_ns"]).to_pylist()
+    assert table["received_ns"].cast("int64").to_pylist() == [T0, T0 + 1, T0 + 2, T0 + 3, T0 + 9]
+    assert table["header.stamp"].to_pylist() == [T0 + 7] * 4 + [None]
     assert (rows[1]["joints"], rows[1]["ids"], rows[1]["f"]) == ([1.0, 2.5], [1, 2], 0.5)
     assert rows[0]["f"] != rows[0]["f"], "NaN is a number that is not one"
     assert (rows[1]["big"], rows[1]["mixed"], rows[1]["empty"]) == (str(2**64 - 1), '[{"a": 1}]', [])
@@ -564,9 +612,9 @@ def test_a_field_that_is_named_as_a_column_of_every_table_has_one_of_its_own(tmp
     assert (row["topic"], row[".topic"], row[".number"], row["received"]) == ("/its", "mine", "5", "1.5")
     assert (row["received_ns"], row[".received_ns"]) == (str(T0 + 1), "6")
     table = parquet(tmp_path / "t.parquet", [record(1, "pkg/msg/A", fields, "/its")])
-    [found] = table.drop(["received", "captured"]).to_pylist()
-    assert (found["topic"], found[".topic"], found[".number"], found[".received"]) == ("/its", "mine", 5, 1.5)
-    assert found["received_ns"] == 6
+    [found] = table.drop(["received_ns", "captured_ns"]).to_pylist()
+    assert (found["topic"], found[".topic"], found[".number"], found["received"]) == ("/its", "mine", 5, 1.5)
+    assert found[".received_ns"] == 6
 
 
 def test_whatever_only_a_lying_robot_signs_a_table_can_be_read(tmp_path):
@@ -575,8 +623,8 @@ def test_whatever_only_a_lying_robot_signs_a_table_can_be_read(tmp_path):
     lying = record(1, "pkg/msg/A", fields)
     lying = lying._replace(place=PLACE._replace(number=2**64 - 1))
     table = parquet(tmp_path / "t.parquet", [lying])
-    [found] = table.drop(["received", "captured"]).to_pylist()
-    assert (found["number"], found["topic"], found["a.b"], found["\\u0001"]) == (2**64 - 1, "/t", 8, 5)
+    [found] = table.drop(["received_ns", "captured_ns"]).to_pylist()
+    assert (found["number"], found["topic"], found["a.b"], found["\\u0001"]) == (str(2**64 - 1), "/t", 8, 5)
     assert [found[f"{'.' * n}topic"] for n in (1, 2, 3)] == [1, 2, 3]
     with outputs.table(tmp_path / "t.csv") as written:
         written.write(lying)
@@ -597,10 +645,11 @@ def test_a_parquet_file_of_nothing_has_its_columns(tmp_path):
     assert parquet(tmp_path / "t.parquet", []).num_rows == 0
 
 
-def test_without_pyarrow_parquet_is_refused_before_anything_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match="pip install pyarrow"):
-        outputs.check_table(tmp_path / "t.parquet")
+@pytest.mark.parametrize(("name", "without"), [("t.csv", "pandas"), ("t.parquet", "pandas"), ("t.parquet", "pyarrow")])
+def test_without_pandas_or_pyarrow_a_table_is_refused_before_anything_is_read(tmp_path, monkeypatch, name, without):
+    monkeypatch.setattr(outputs, "find_spec", lambda name: None if name == without else True)
+    with pytest.raises(ConfigError, match=r"pip install 'pysmcrypto\[table\]'"):
+        outputs.check_table(tmp_path / name)
 
 
 # --- files that grow
@@ -660,24 +709,3 @@ def test_what_was_flushed_is_there_after_a_kill(tmp_path: Path):
                 for one in StreamReader(file).records:
                     got += [one] if isinstance(one, Message) else []
             assert len(got) in (3, 4)
-
-
-def test_a_csv_file_that_grows_is_at_every_flush_what_it_would_be_at_the_end(tmp_path: Path):
-    def rows(path: Path) -> list[dict[str, Any]]:
-        with path.open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    grows, given = tmp_path / "g.csv", list[ProvenRecord]()
-    with outputs.table(grows, grows=True) as made:
-        assert rows(grows) == []
-        for n in range(6):
-            given.append(record(n, "a/msg/A", {"x": n, **({"late": "=1"} if n > 3 else {})}))
-            made.write(given[-1])
-            if n != 2:
-                made.flush()
-                with outputs.table(tmp_path / f"{n}.csv") as whole:
-                    for one in given:
-                        whole.write(one)
-                assert rows(grows) == rows(tmp_path / f"{n}.csv")
-                assert len(rows(grows)) == n + 1
-    assert [row["late"] for row in rows(grows)] == ["", "", "", "", "'=1", "'=1"]

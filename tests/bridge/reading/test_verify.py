@@ -35,7 +35,7 @@ from rosbridge_eth.capture.lines import parse_line
 from rosbridge_eth.chunk import Chunk, Log, check_proof, proofs, robot_id
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
-from rosbridge_eth.reading.verdict import Kind
+from rosbridge_eth.reading.verdict import Findings, Kind
 from rosbridge_eth.reading.verify import NO_DIGEST, Verifier
 
 
@@ -110,7 +110,7 @@ def test_an_altered_header_is_forged():
 def test_an_altered_body_is_told_and_the_chunk_keeps_its_place_in_the_log():
     chunks = Pen().chunks(3)
     result = read([chunks[0], body_tampered(chunks[1]), chunks[2]])
-    assert result.only(Kind.ALTERED).first == 1
+    assert result.only(Kind.ALTERED).places[0][0] == 1
     assert result.numbers == [0, 2]
     assert not result.verdict.sound
 
@@ -131,92 +131,29 @@ def test_another_robots_chunk():
 def test_a_chunk_that_was_written_for_another_contract_is_refused():
     other = b"M" * 32
     chunk = Pen(log=Log(other, LOG.tk)).write(message(1))
-    assert read([chunk]).only(Kind.FORGED).first == 0
-    assert read([chunk], elsewhere=[b"N" * 32, other]).only(Kind.ELSEWHERE).first == 0
-    assert read([body_tampered(chunk)], elsewhere=[other]).only(Kind.ELSEWHERE).first == 0
+    assert read([chunk]).only(Kind.FORGED).places[0][0] == 0
+    assert read([chunk], elsewhere=[b"N" * 32, other]).only(Kind.ELSEWHERE).places[0][0] == 0
+    assert read([body_tampered(chunk)], elsewhere=[other]).only(Kind.ELSEWHERE).places[0][0] == 0
 
 
 def test_a_dropped_form_that_the_robot_did_not_sign():
     chunk = Pen().chunks(1)[0]
-    assert read([replace(chunk, body=b"")]).only(Kind.FORGED).first == 0
+    assert read([replace(chunk, body=b"")]).only(Kind.FORGED).places[0][0] == 0
 
 
 def test_the_contracts_hash_of_the_last_chunk_is_held_against_it():
     data = events(Pen().chunks(3))
     stands = standing(data, [registration()])._replace(tail=b"x" * 32)
-    assert read(data=data, stands=stands).only(Kind.ALTERED).first == 2
+    assert read(data=data, stands=stands).only(Kind.ALTERED).places[0][0] == 2
 
 
-# --- the archive
-
-
-def archive_of(*chunks: Chunk) -> dict[bytes, bytes]:
-    return {chunk.header.body_digest: chunk.body for chunk in chunks}
-
-
-def looked_up(bodies: dict[bytes, bytes]):
-    return lambda digest, length: bodies.get(digest)
-
-
-def archived_log() -> list[Chunk]:
+def test_a_header_without_its_body_is_dropped_only_if_the_robot_signed_that():
     pen = Pen()
-    return [pen.write(message(0)), pen.write(message(1), message(2), archived=True), pen.write(message(3)),
-            pen.write(message(4), archived=True, goodbye=True)]  # fmt: skip
-
-
-def test_archived_chunks_are_read_from_the_archive_as_the_others_from_the_chain():
-    chunks = archived_log()
-    result = read(chunks, bodies=looked_up(archive_of(*chunks)))
-    assert result.found == [] and result.verdict.sound
-    assert result.numbers == [0, 1, 2, 3, 4]
-    assert [each.chunk for each in result.chunks] == chunks  # with the bodies: proofs of records can be made of them
-
-
-@pytest.mark.parametrize(
-    ("spoil", "said"),
-    [
-        (lambda bodies, digest: bodies.pop(digest), "is not in the archive"),
-        (lambda bodies, digest: bodies.update({digest: bodies[digest][:-1] + b"x"}), "is another in the archive"),
-        (lambda bodies, digest: bodies.update({digest: b""}), "is another in the archive"),
-        (lambda bodies, digest: bodies.update({digest: bodies[digest] + b"x"}), "is another in the archive"),
-    ],
-    ids=["gone", "altered", "empty", "longer"],
-)
-def test_a_body_that_the_archive_has_no_more_is_withheld_and_hides_nothing_else(spoil, said):
-    chunks = archived_log()
-    bodies, digest = archive_of(*chunks), chunks[1].header.body_digest
-    spoil(bodies, digest)
-    for key in (reader(), None):
-        result = read(chunks, bodies=looked_up(bodies), key=key, keyless=key is None)
-        told = [one for one in result.verdict.findings if one.kind is not Kind.NO_GRANT]
-        assert [(one.kind, one.first, one.last, one.count) for one in told] == [(Kind.WITHHELD, 1, 1, 1)]
-        assert told[0].detail == f"the body {digest.hex()} {said}"
-        assert not result.verdict.sound
-    assert read(chunks, bodies=looked_up(bodies)).numbers == [0, 3, 4]
-    mark = result.verifier.bookmark()  # the chain kept nothing back: that its end was seen is not forgotten
-    assert mark is not None and mark.count == 4 and result.verifier.honest and not result.verifier.keeps
-
-
-def test_without_an_archive_its_records_are_told_and_nothing_is_said_against_them():
-    result = read(archived_log())
-    assert result.verdict.sound and result.numbers == [0, 3]
-    assert result.found == [("archived", 1, 3, 3)]
-
-
-def test_an_archived_chunk_that_the_robot_dropped_is_not_looked_for():
-    pen = Pen()
-    dropped = pen.drop(pen.write(message(1), message(2), archived=True))
-    asked: list[bytes] = []
-    result = read([dropped, *pen.chunks(1)], bodies=lambda digest, length: asked.append(digest))
-    assert result.found == [("dropped", 0, 0, 2)] and not asked
-
-
-def test_an_archived_header_that_nobody_signed_is_forged_and_not_looked_for():
-    chunk = Pen().write(message(1), archived=True)
-    stranger = replace(chunk, signature=bytes(63) + b"\1")
-    asked: list[bytes] = []
-    assert read([stranger], bodies=lambda digest, length: asked.append(digest)).only(Kind.FORGED).first == 0
-    assert not asked
+    whole = pen.write(message(1), message(2))
+    dropped = pen.drop(whole)
+    assert read([dropped, *pen.chunks(1)]).found == [("dropped", 0, 0, 2)]
+    assert read([replace(whole, body=b"")]).only(Kind.FORGED).places[0][0] == 0
+    assert read([replace(dropped, body=whole.body)]).only(Kind.FORGED).places[0][0] == 0
 
 
 # --- what is not there
@@ -262,7 +199,7 @@ def test_a_node_that_claims_an_immense_log_costs_no_memory():
 def test_chunks_that_the_server_left_out(gone):
     chunks = Pen().chunks(6)
     found = read(chunks[:2] + chunks[2 + gone :]).only(Kind.MISSING)
-    assert (found.first, found.count) == (2, gone)
+    assert (found.places[0][0], found.count) == (2, gone)
 
 
 def test_a_first_chunk_that_is_not_the_logs_first():
@@ -283,14 +220,14 @@ def test_a_stream_that_was_left_out_whole():
     pen.new_stream(b"b" * 16)
     pen.chunks(2, goodbye=True)
     pen.new_stream(b"c" * 16)
-    assert read([*first, *pen.chunks(2)]).only(Kind.MISSING).first == 2
+    assert read([*first, *pen.chunks(2)]).only(Kind.MISSING).places[0][0] == 2
 
 
 def test_streams_that_were_left_out_before_the_first():
     pen = Pen()
     pen.chunks(2, goodbye=True)
     pen.new_stream(b"b" * 16)
-    assert read(pen.chunks(2)).only(Kind.MISSING).first == 0
+    assert read(pen.chunks(2)).only(Kind.MISSING).places[0][0] == 0
 
 
 def test_no_order_but_the_robots_own_is_sound():
@@ -312,7 +249,7 @@ def test_two_chunks_with_one_number():
     first, second = pen.chunks(2)
     other = Pen(number=1, previous=first.header.digest, sealed_ms=pen.sealed_ms).write(message(9))
     found = read([first, second, other]).only(Kind.FORKED)
-    assert (found.first, found.count) == (2, 1)
+    assert (found.places[0][0], found.count) == (2, 1)
     assert "follows the chunk of index 0" in found.detail
 
 
@@ -323,7 +260,7 @@ def test_a_fork_shows_in_what_follows_even_if_the_other_branch_is_not_written():
     hidden = Pen(number=1, previous=first[0].header.digest, sealed_ms=pen.sealed_ms).write(message(9))
     third = pen.write(message(2))
     found = read([first[0], hidden, third]).only(Kind.FORKED)
-    assert "where another one is" in found.detail or found.first == 2
+    assert "where another one is" in found.detail or found.places[0][0] == 2
 
 
 def test_a_restored_disk_goes_on_from_an_older_chunk():
@@ -416,7 +353,7 @@ def test_a_registered_certificate_that_is_not_to_be_trusted(identity):
 @pytest.mark.parametrize("certificates", [b"", b"\x30\x82", b"junk" * 100])
 def test_a_registration_without_certificates(certificates):
     registered = [registration(certificates=certificates)]
-    assert read(Pen().chunks(1), registrations=registered).only(Kind.UNTRUSTED).first == 0
+    assert read(Pen().chunks(1), registrations=registered).only(Kind.UNTRUSTED).places[0][0] == 0
 
 
 def test_a_robot_without_registration():
@@ -447,7 +384,7 @@ def test_what_was_sealed_after_the_certificates_end():
     pen = Pen()
     chunks = [pen.write(message(0)), pen.write(message(1), sealed_ms=after_the_end() * 1000)]
     result = read(chunks)
-    assert result.only(Kind.UNTRUSTED).first == 1
+    assert result.only(Kind.UNTRUSTED).places[0][0] == 1
     assert result.numbers == [0]
 
 
@@ -491,7 +428,7 @@ def test_a_key_that_the_robot_wrapped_wrongly(monkeypatch):
     chunk = pen.write(message(1))
     monkeypatch.undo()
     result = read([chunk, *Pen(number=1, previous=pen.previous, sealed_ms=pen.sealed_ms).chunks(1)])
-    assert result.only(Kind.UNOPENABLE).first == 0
+    assert result.only(Kind.UNOPENABLE).places[0][0] == 0
     assert result.numbers == [1]
 
 
@@ -501,7 +438,7 @@ def test_a_root_that_is_not_the_records(monkeypatch):
     with monkeypatch.context() as lie:
         lie.setattr(chunks, "_leaf", lambda salt, line: b"\0" * 32)
         lying = Pen().write(message(1), message(2))
-    assert read([lying]).only(Kind.UNOPENABLE).first == 0
+    assert read([lying]).only(Kind.UNOPENABLE).places[0][0] == 0
 
 
 HOSTILE = [
@@ -531,7 +468,7 @@ def test_a_line_that_does_not_parse_is_told_and_hides_nothing_else(hostile):
     pen = Pen()
     result = read([pen.write(message(1), hostile, message(2)), pen.write(message(3))])
     found = result.only(Kind.UNOPENABLE)
-    assert found.first == 0
+    assert found.places[0][0] == 0
     assert found.detail.startswith("line 1:")
     assert result.numbers == [1, 2, 3]
     assert all(text.isprintable() for text in result.verdict.lines())
@@ -596,9 +533,36 @@ def test_what_the_robot_dropped_is_summed():
     chunks = pen.chunks(6, records=7)
     result = read([pen.drop(chunk) if n in (1, 2, 4) else chunk for n, chunk in enumerate(chunks)])
     found = result.only(Kind.DROPPED)
-    assert (found.first, found.last, found.count) == (1, 4, 21)
+    assert (found.places, found.count) == ([(1, 2), (4, 4)], 21)
+    assert "dropped: chunks 1 to 2, 4: 21 records: " in "\n".join(result.verdict.lines())
+    assert result.verdict.as_json()["findings"][0]["places"] == [(1, 2), (4, 4)]
     assert result.verdict.sound
     assert len(result.numbers) == 21
+
+
+def test_of_endlessly_many_places_the_first_are_kept_and_the_others_counted():
+    findings = Findings({}, [])
+    for n in range(1_000):
+        findings.add(Kind.DROPPED, 2 * n, count=3)
+    [found] = findings.kept
+    assert (len(found.places), found.more, found.count) == (100, 900, 3_000)
+    assert "196, 198 and 900 places behind: 3,000 records" in str(found)
+
+
+@pytest.mark.parametrize("between", [0, 2])
+def test_a_whole_chunk_behind_its_dropped_form_is_opened_once(between):
+    pen = Pen()
+    chunks = pen.chunks(4, records=2)
+    order = [chunks[0], pen.drop(chunks[1]), *chunks[2 : 2 + between], chunks[1], *chunks[2 + between :]]
+    result = read(order)
+    opened = [0, 1, *range(4, 4 + 2 * between), 2, 3, *range(4 + 2 * between, 8)]
+    assert result.numbers == opened
+    assert result.verdict.sound and result.verdict.counts == {"dropped": 2}
+    altered = replace(chunks[1], body=bytes([chunks[1].body[0] ^ 1]) + chunks[1].body[1:])
+    result = read([*order[:-1], altered, order[-1], chunks[1]])
+    assert result.numbers == opened and result.verdict.counts["forked"] >= 1, "once, and nothing is opened twice"
+    first = read([chunks[0], pen.drop(chunks[1]), altered, chunks[1]])
+    assert first.numbers == [0, 1, 2, 3] and not first.verdict.sound
 
 
 def test_what_was_lost_before_sealing_is_summed_by_topic_and_reason():

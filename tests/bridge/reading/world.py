@@ -67,13 +67,10 @@ class Pen:
     sealed_ms: int = T0 * 1000
     readers: Sequence[Identity] = field(default_factory=lambda: (reader(),))
 
-    def write(
-        self, *lines: bytes, goodbye: bool = False, archived: bool = False, sealed_ms: int | None = None
-    ) -> Chunk:
+    def write(self, *lines: bytes, goodbye: bool = False, sealed_ms: int | None = None) -> Chunk:
         self.sealed_ms = self.sealed_ms + 1000 if sealed_ms is None else sealed_ms
         chunk = seal(
             self.log, self.identity.signing_key, lines, stream=self.stream, number=self.number, goodbye=goodbye,
-            archived=archived,
             previous=self.previous, sealed_ms=self.sealed_ms,
             readers=[one.encryption_key.public_key for one in self.readers],
         )  # fmt: skip
@@ -106,7 +103,7 @@ def revocation(index: int, block: int, previous: int = 1) -> RegistrationEvent:
 
 
 def events(chunks: Sequence[Chunk | bytes], per_event: int = 3, first: int = 0) -> list[DataEvent]:
-    encoded = [chunk if isinstance(chunk, bytes) else chunk.on_chain.encoded for chunk in chunks]
+    encoded = [chunk if isinstance(chunk, bytes) else chunk.encoded for chunk in chunks]
     return [
         DataEvent(first + at, 0, tuple(encoded[at : at + per_event]), first + at + per_event + 1, b"\x11" * 32, ACCOUNT)
         for at in range(0, len(encoded), per_event)
@@ -137,7 +134,7 @@ class Read:
     @property
     def found(self) -> list[tuple[str, int, int, int]]:
         """(kind, first, last, count) of each finding."""
-        return [(one.kind.label, one.first, one.last, one.count) for one in self.verdict.findings]
+        return [(one.kind.label, one.places[0][0], one.places[-1][1], one.count) for one in self.verdict.findings]
 
     @property
     def numbers(self) -> list[Any]:
@@ -153,8 +150,9 @@ class Read:
     def at(self) -> dict[str, Any]:
         """Where the next reading goes on."""
         links = Links()
-        for digest, index in zip(self.verifier.links.digests, self.verifier.links.indices, strict=True):
-            links.add(digest.to_bytes(8, "big"), index)
+        known = self.verifier.links
+        for digest, index, dropped in zip(known.digests, known.indices, known.dropped, strict=True):
+            links.add(digest.to_bytes(8, "big"), index, bool(dropped))
         progress = TypeAdapter(Progress)
         return {"at": progress.validate_json(progress.dump_json(self.verifier.progress())), "links": links}
 

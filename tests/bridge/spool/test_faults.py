@@ -160,7 +160,7 @@ def test_a_disk_that_the_spool_itself_fills_takes_the_new_at_the_expense_of_the_
     spool.close()
 
 
-def test_a_disk_that_others_fill_is_survived_and_everything_that_was_kept_stays_readable(disk):
+def test_a_disk_that_others_fill_is_survived_and_everything_that_was_kept_stays_readable(disk, caplog):
     spool = open_spool(disk / "spool.sqlite")
     made = list(chain(400, size=4000))
     for one in made[:50]:
@@ -168,6 +168,8 @@ def test_a_disk_that_others_fill_is_survived_and_everything_that_was_kept_stays_
     ballast = disks.fill_up(disk)
     for one in made[50:]:
         spool.append(one)
+    [told] = [event.getMessage() for event in caplog.records if event.levelname == "WARNING"]
+    assert str(disk) in told and "is full" in told and "the oldest chunks give way" in told
     found = all_of(spool)
     assert found[-1] == made[-1]
     assert all(one in (whole, dropped(whole)) for one, whole in zip(found, made[found[0].header.number :], strict=True))

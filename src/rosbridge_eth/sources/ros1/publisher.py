@@ -20,8 +20,7 @@ LAST_RETRY: Final = 10.0
 STEADY: Final = 10.0
 """A connection that lasted so long was a good one: the next attempt is the first again."""
 STALLED = 30.0
-SLOWEST: Final = 100_000
-"""A message is to arrive within STALLED seconds, and one more for so many bytes."""
+"""Seconds without a byte, within a message, after which a publisher is given up."""
 FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError)
 """What a peer can bring about: it says what is wrong, is gone or silent, or has a name that is none."""
 
@@ -65,9 +64,8 @@ class Publisher(threading.Thread):
     def _connect(self) -> None:
         node, topic = self._node, self.topic
         answer = api.call(
-            read_uri(self.uri), node.deadlines, node.timeout, api.PEER_BODY,
-            "requestTopic", node.caller_id, topic, [["TCPROS"]],
-        )  # fmt: skip
+            read_uri(self.uri), node.timeout, "requestTopic", node.caller_id, topic, [["TCPROS"]]
+        )
         with (
             socket.create_connection(api.tcpros_address(answer), node.timeout) as sock,
             sock.makefile("rb") as stream,
@@ -76,27 +74,26 @@ class Publisher(threading.Thread):
             self._socket = sock
             if self.over.is_set():
                 return
-            with node.deadlines.within(sock, node.timeout):
-                sock.sendall(tcpros.request_header(topic, node.caller_id))
-                publication = tcpros.read_publication(topic, tcpros.read_header(stream))
+            sock.sendall(tcpros.request_header(topic, node.caller_id))
+            publication = tcpros.read_publication(topic, tcpros.read_header(stream))
             node.admit(self, publication)
             self._read(sock, stream, publication)
 
     def _read(self, sock: socket.socket, stream: BinaryIO, publication: tcpros.Publication) -> None:
         node = self._node
         while True:
-            length = tcpros.read_length(stream)  # until then, silence is no fault
-            with node.deadlines.within(sock, STALLED + length / SLOWEST), node.room(length) as fits:
-                if fits:
-                    node.received(self.topic, publication, tcpros.read_exactly(stream, length))
-                else:
-                    node.passed_over(self, length)
-                    tcpros.pass_over(stream, length)
+            sock.settimeout(None)  # between messages, silence is no fault
+            length = tcpros.read_length(stream)
+            sock.settimeout(STALLED)
+            if length <= node.max_message:
+                node.received(self.topic, publication, tcpros.read_exactly(stream, length))
+            else:
+                node.passed_over(self, length)
+                tcpros.pass_over(stream, length)
 
 
 def _tune(sock: socket.socket) -> None:
-    """Blocking, without delay; notice within about two minutes that the other machine is gone."""
-    sock.settimeout(None)
+    """Without delay; notice within about two minutes that the other machine is gone."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 6)):

@@ -21,7 +21,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -45,8 +45,6 @@ MAX_CONNECTIONS: Final = 512
 """Connections to publishers at once: threads, and file descriptors, of which a process usually has 1,024."""
 DOORBELL_REST: Final = 0.1
 """Seconds between looks at the least, however often the doorbell rings."""
-SMALL: Final = 1 << 14
-"""Bytes of a message that is not counted among those that are arriving."""
 FAREWELL: Final = 0.6
 """Seconds in which the master is told that we leave."""
 STOP_PATIENCE: Final = 1.0
@@ -83,11 +81,10 @@ class Ros1Source(LiveSource):
         self._master = addressing.master_address(master)
         self.caller_id = self._base_name = addressing.node_name(node)
         self._renamed = 0
-        self._max_message, self._arriving = max_message, 0
+        self.max_message = max_message
         self._topics: dict[str, _Topic] = {}
         self._publishers: set[Publisher] = set()  # whose threads have not ended
         self._rung = threading.Event()
-        self.deadlines = api.Deadlines()
         self._uri = ""
         self._named = self._answers = self._looked = False
 
@@ -111,7 +108,6 @@ class Ros1Source(LiveSource):
         self._rung.set()
         if self._receiving.is_alive():
             self._receiving.join(STOP_PATIENCE)
-        self.deadlines.close()
 
     def _receive(self) -> None:
         while (own := addressing.own_host(self._hostname, self._master)) is None:
@@ -145,8 +141,7 @@ class Ros1Source(LiveSource):
     # The master
 
     def _call(self, method: str, *parameters: str, timeout: float | None = None) -> Any:
-        limits = self.deadlines, timeout or self.timeout, api.MASTER_ANSWER
-        return api.call(self._master, *limits, method, self.caller_id, *parameters)
+        return api.call(self._master, timeout or self.timeout, method, self.caller_id, *parameters)
 
     def _look(self) -> None:
         """Look at the master's state, and do what is missing."""
@@ -282,19 +277,6 @@ class Ros1Source(LiveSource):
             self.counts[publisher.topic, "connected"] += 1
         log.info("%s: reading %s from %s", publisher.topic, publication.type_name, publication.node or publisher.uri)
 
-    @contextlib.contextmanager
-    def room(self, length: int) -> Iterator[bool]:
-        """Whether a message of this length is read now: of all that are arriving, at most two of the largest."""
-        counted = length if length > SMALL else 0
-        with self._lock:
-            fits = length <= self._max_message and self._arriving + counted <= 2 * self._max_message
-            self._arriving += counted * fits
-        try:
-            yield fits
-        finally:
-            with self._lock:
-                self._arriving -= counted * fits
-
     def received(self, topic: str, publication: Publication, body: bytes) -> None:
         """A message is complete."""
         received_ns = self._clock.wall_ns()
@@ -308,8 +290,7 @@ class Ros1Source(LiveSource):
             self.counts[publisher.topic, "too_large"] += 1
         self._say(
             f"too large {publisher.topic}",
-            f"{publisher.topic}: a message of {length} bytes is left out; at most {self._max_message} bytes of a "
-            f"message are read, and {2 * self._max_message} of all that are arriving",
+            f"{publisher.topic}: a message of {length} bytes is left out; at most {self.max_message} bytes are read",
         )
 
     def ended(self, publisher: Publisher, error: Exception) -> None:

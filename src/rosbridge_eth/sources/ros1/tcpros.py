@@ -129,10 +129,9 @@ def read_publication(topic: str, fields: Mapping[str, str]) -> Publication:
 def _decoder(name: str, md5: str, text: str) -> Decoder:
     if not text.strip() and (known := decoder_for_known(Wire.ROS1, name)) and known.definition.md5 == md5:
         return known
+    if not text.strip():
+        raise DefinitionError(f"the publisher does not define {name}, and it is not the one that Noetic ships")
     decoder = decoder_for(Wire.ROS1, name, text)
-    computed = decoder.definition.md5
-    if computed != md5:
-        if not text.strip():
-            raise DefinitionError(f"the publisher does not define {name}, and it is not the one that Noetic ships")
+    if (computed := decoder.definition.md5) != md5:
         raise DefinitionError(f"the definition of {name} has the md5 sum {computed}, not {md5} as announced")
     return decoder

@@ -13,10 +13,10 @@ they offer changes, the subscription changes too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import Fielddefs
@@ -75,29 +75,6 @@ def type_hash_of(endpoint: Any) -> str | None:
 def first_line(error: BaseException) -> str:
     """What an error of rclpy says, without the places in its own code."""
     return str(error).strip().partition("\n")[0].partition(", at ")[0] or type(error).__name__
-
-
-class Quality(NamedTuple):
-    """reliable: lost samples are sent again. latched: late subscribers get the last samples (transient local)."""
-
-    reliable: bool
-    latched: bool
-
-    def __str__(self) -> str:
-        return f"{'reliable' if self.reliable else 'best effort'}, {'transient local' if self.latched else 'volatile'}"
-
-
-def quality_of(endpoint: Any) -> Quality:
-    """What an endpoint offers; a policy that is not known counts as the lesser."""
-    profile = endpoint.qos_profile
-    latched = profile.durability.name in ("TRANSIENT_LOCAL", "PERSISTENT")
-    return Quality(profile.reliability.name == "RELIABLE", latched)
-
-
-def most_that_all_offer(offered: Iterable[Quality]) -> Quality:
-    """What a subscription can ask for and be matched by every one of them; of none: the most."""
-    known = list(offered)
-    return Quality(all(quality.reliable for quality in known), all(quality.latched for quality in known))
 
 
 def message_class(type_name: str) -> Any:

@@ -3,10 +3,11 @@
 Messages are subscribed to as bytes and decoded by rosbags, as those of every other source: equal messages give equal
 records. Every LOOK_EVERY the graph is read (from rclpy's own memory, microseconds): topics appear, publishers change
 what they offer. A subscription stays for KEEP after the last publisher has gone, so that one that is restarted misses
-nothing.
+nothing. It asks for the best that all publishers offer at its beginning (BEST_AVAILABLE); when one comes that offers
+less, it is made anew, in which messages may be lost.
 
-Where the middleware numbers messages and says who published them (Fast DDS on Kilted), losses are counted and a change
-of subscription loses and repeats nothing.
+Where the middleware numbers messages and says who published them (Fast DDS on Kilted), losses are counted and nothing
+is taken twice.
 """
 
 from __future__ import annotations
@@ -30,8 +31,6 @@ KEEP: Final = 300.0
 """Seconds that a subscription outlives the last publisher."""
 AT_ONCE: Final = 32
 """Messages of one topic taken before the others get their turn."""
-OVERLAP: Final = 1.0
-"""Seconds that a subscription and the one that takes its place both run: publishers learn of a new one late."""
 UNMATCHED_AFTER: Final = 5.0
 """Seconds after which names that nothing publishes are told."""
 STOP_TIME: Final = 2.0
@@ -46,17 +45,13 @@ class _Topic:
     offer: Offer
     generated: Any
     decoder: Decoder
-    quality: parts.Quality
-    subscriptions: int = 0  # so far
     subscription: Any = None
-    leaving: Any = None  # the subscription that `subscription` takes the place of
-    leaves_at: float = 0.0
+    refused: bool = False  # a publisher offers less than it asks for
     type_hash: str | None = None
     publishers: frozenset[bytes] = frozenset()
     foreign: frozenset[bytes] = frozenset()
     last_seen: float = 0.0
     sequence: dict[bytes, int] = field(default_factory=dict)
-    numbered: bool = False  # whether the middleware says publisher and number of a message
 
 
 class Ros2Source(live.LiveSource):
@@ -156,11 +151,13 @@ class Ros2Source(live.LiveSource):
             self._leave(self._topics.pop(key))
         for key, offer in wanted.items():
             if key not in self._topics and key not in self._unusable:
-                self._join(offer, publishers.get(key, []), now)
+                self._join(offer, now)
         for key, topic in self._topics.items():
-            found = publishers.get(key, [])
-            self._know(topic, found)
-            self._adapt(topic, found, now)
+            self._know(topic, publishers.get(key, []))
+            if topic.refused:
+                self._node.destroy_subscription(topic.subscription)
+                topic.subscription, topic.refused = self._subscribe(topic), False
+                log.info("%s: publishers changed, watched anew", topic.offer.topic)
 
     def _read_graph(self, only_wanted: bool = False) -> tuple[list[Offer], dict[tuple[str, str], list[Any]]]:
         """What is offered, and by which endpoints. only_wanted: leave out what no name or pattern of a topic means."""
@@ -184,40 +181,37 @@ class Ros2Source(live.LiveSource):
             offers += [Offer(name, kind, tuple(sorted(found))) for kind, found in sorted(nodes.items())]
         return offers, publishers
 
-    def _join(self, offer: Offer, publishers: Sequence[Any], now: float) -> None:
+    def _join(self, offer: Offer, now: float) -> None:
         key = (offer.topic, offer.type_name)
         try:
-            quality = parts.most_that_all_offer(map(parts.quality_of, publishers))
             decoder = decoder_for(Wire.CDR, offer.type_name, parts.definition_text(offer.type_name))
-            topic = _Topic(offer, parts.message_class(offer.type_name), decoder, quality, last_seen=now)
-            topic.subscription = self._subscribe(topic, quality)
+            topic = _Topic(offer, parts.message_class(offer.type_name), decoder, last_seen=now)
+            topic.subscription = self._subscribe(topic)
         except SourceError as error:
             self._unusable.add(key)
             log.warning("%s is left out: %s", offer, error)
             return
         self._topics[key] = topic
-        log.info("%s: watched (%s, %s)", offer.topic, offer.type_name, topic.quality)
+        log.info("%s: watched (%s)", offer.topic, offer.type_name)
 
-    def _subscribe(self, topic: _Topic, quality: parts.Quality) -> Any:
+    def _subscribe(self, topic: _Topic) -> Any:
         qos = self._rclpy.qos
         profile = qos.QoSProfile(
             depth=self._depth, history=qos.HistoryPolicy.KEEP_LAST,
-            reliability=getattr(qos.ReliabilityPolicy, "RELIABLE" if quality.reliable else "BEST_EFFORT"),
-            durability=getattr(qos.DurabilityPolicy, "TRANSIENT_LOCAL" if quality.latched else "VOLATILE"),
+            reliability=qos.ReliabilityPolicy.BEST_AVAILABLE, durability=qos.DurabilityPolicy.BEST_AVAILABLE,
         )  # fmt: skip
+
+        def incompatible(event: Any) -> None:
+            """A publisher has come that offers less than is asked for: look at once, not at the next turn."""
+            topic.refused = self._look_now = True
+
         try:
-            events = self._rclpy.SubscriptionEventCallbacks(
-                incompatible_qos=self._incompatible, use_default_callbacks=False
-            )
+            events = self._rclpy.SubscriptionEventCallbacks(incompatible_qos=incompatible, use_default_callbacks=False)
             return self._node.create_subscription(
                 topic.generated, topic.offer.topic, self._callback(topic), profile, event_callbacks=events, raw=True
             )
         except (RuntimeError, ValueError, TypeError) as error:
             raise SourceError(f"it cannot be subscribed to: {parts.first_line(error)}") from error
-
-    def _incompatible(self, event: Any) -> None:
-        """A publisher has come that offers less than we ask for: look at once, not at the next turn."""
-        self._look_now = True
 
     def _know(self, topic: _Topic, publishers: Sequence[Any]) -> None:
         """Who publishes the topic now, and who of them with another definition of its type."""
@@ -239,52 +233,15 @@ class Ros2Source(live.LiveSource):
         for gone in topic.sequence.keys() - present.keys():
             del topic.sequence[gone]
 
-    def _adapt(self, topic: _Topic, publishers: Sequence[Any], now: float) -> None:
-        """Subscribe anew if the publishers offer more or less than is asked for.
-
-        Where messages are numbered, nothing is lost or repeated by that: both
-        subscriptions run for a while, and what both bring is taken once.
-        """
-        if topic.leaving is not None:
-            if now >= topic.leaves_at:
-                self._drain(topic)
-                self._node.destroy_subscription(topic.leaving)
-                topic.leaving = None
-            return
-        wanted = parts.most_that_all_offer(map(parts.quality_of, publishers))
-        if not publishers or wanted == topic.quality:
-            return
-        if topic.numbered:
-            topic.leaving, topic.leaves_at = topic.subscription, now + OVERLAP
-        elif (topic.quality.reliable and not wanted.reliable) or (topic.quality.latched and not wanted.latched):
-            self._node.destroy_subscription(topic.subscription)
-        else:
-            return  # asking for more would bring latched messages again, and nothing tells that they were seen
-        topic.subscription, topic.quality = self._subscribe(topic, wanted), wanted
-        log.info("%s: publishers changed, now watched as %s", topic.offer.topic, wanted)
-
-    def _drain(self, topic: _Topic) -> None:
-        """Take what the leaving subscription holds, which is older than what the new one brings."""
-        while (waiting := parts.take(topic.leaving, topic.generated)) is not None:
-            self._arrived(topic, *waiting)
-
     def _leave(self, topic: _Topic) -> None:
-        for subscription in (topic.subscription, topic.leaving):
-            if subscription is not None:
-                self._node.destroy_subscription(subscription)
+        self._node.destroy_subscription(topic.subscription)
         log.info("%s: left", topic.offer.topic)
 
     def _callback(self, topic: _Topic) -> Callable[[bytes, Any], None]:
-        topic.subscriptions += 1
-        number = topic.subscriptions
-
         def arrived(raw: bytes, info: Any) -> None:
-            current = number == topic.subscriptions
-            if current and topic.leaving is not None:
-                self._drain(topic)
             self._arrived(topic, raw, info)
             # What else waits is taken at once: a turn of the executor costs several times as much as a message.
-            for _ in range(AT_ONCE if current else 0):
+            for _ in range(AT_ONCE):
                 if (waiting := parts.take(topic.subscription, topic.generated)) is None:
                     break
                 self._arrived(topic, *waiting)
@@ -304,7 +261,6 @@ class Ros2Source(live.LiveSource):
             return
         number = info.get("publication_sequence_number")
         if publisher is not None and number is not None:
-            topic.numbered = True
             last = topic.sequence.get(publisher)
             if last is not None and number <= last:
                 return  # received before the subscription was changed
@@ -320,7 +276,7 @@ class Ros2Source(live.LiveSource):
     def _tell_lost(self, topic: _Topic, count: int) -> None:
         name = topic.offer.topic
         self.counts[name, "lost"] += count
-        why = "a larger depth in [source] may help" if topic.quality.reliable else "its publisher is best effort"
+        why = "its publisher is best effort, or a larger depth in [source] helps"
         text = f"{name}: messages were lost on their way here ({count} now, then counted); {why}"
         self._say(f"lost {name}", text)
 

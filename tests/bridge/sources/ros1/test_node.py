@@ -29,7 +29,7 @@ class Script:
         self.calls: list[str] = []
         self.failure: Exception | None = None
 
-    def __call__(self, endpoint, deadlines, timeout, limit, method, caller, *parameters):
+    def __call__(self, endpoint, timeout, method, caller, *parameters):
         self.calls.append(" ".join([method, *(p for p in parameters[:1] if method.endswith("Subscriber"))]))
         if self.failure is not None:
             raise self.failure
@@ -71,7 +71,6 @@ def begun(monkeypatch):
 def scripted(patch: pytest.MonkeyPatch, *topics: str, nodes: tuple[str, ...] = ()) -> Script:
     subject = Ros1Source(Selection(topics, nodes), master="http://m:1", node="me", max_message=1 << 20, timeout=1.0)
     subject._uri = API
-    subject.deadlines.close()
     script = Script(subject)
     patch.setattr(api, "call", script)
     return script
@@ -317,7 +316,7 @@ def test_after_a_master_that_answers_anything_one_that_answers_again_has_us_regi
         script = scripted(patch, "/a", "/b/*", nodes=("/n1",))
         for turn in turns:
 
-            def answer(_endpoint, _deadlines, _timeout, _limit, method, *_more, turn=turn):
+            def answer(_endpoint, _timeout, method, *_more, turn=turn):
                 if method == turn["failing"]:
                     raise TimeoutError
                 return turn[method]

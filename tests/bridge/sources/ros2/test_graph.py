@@ -143,8 +143,7 @@ def test_whatever_quality_is_offered_is_matched(ros: Graph, reliable, latched):
     node.order(create="/t", type=STRING, reliable=reliable, latched=latched, depth=1)
     node.order(publish="/t", fields={"data": "before"})
     watcher = ros.watcher('topics = ["/t"]')
-    words = f"{'reliable' if reliable else 'best effort'}, {'transient local' if latched else 'volatile'}"
-    watcher.says(f"watched ({STRING}, {words})")
+    watcher.says(f"watched ({STRING})")
     if latched and reliable:
         assert data_of(watcher.recorded(1), "/t") == [{"data": "before"}]
     node.order(**{"await": "/t"})
@@ -154,27 +153,25 @@ def test_whatever_quality_is_offered_is_matched(ros: Graph, reliable, latched):
 
 
 def test_publishers_of_one_topic_may_differ_and_change(ros: Graph):
-    """Nothing of the reliable one is lost or repeated while another comes that offers less, and goes."""
+    """One that offers less comes and goes, and all are heard; nothing is repeated."""
     first, second = ros.node("/first"), ros.node("/second")
     first.order(create="/t", type=STRING, latched=True, depth=1)
     first.order(publish="/t", fields={"data": "latched"})
     watcher = ros.watcher('topics = ["/t"]')
     watcher.recorded(1)
     second.order(create="/t", type=STRING, reliable=False)
-    first.order(burst="/t", count=100, rate=200)
-    second.order(**{"await": "/t"})
-    watcher.says("now watched as best effort, volatile")
+    watcher.says("watched anew")
+    for node in (first, second):
+        node.order(**{"await": "/t"})
     second.order(publish="/t", fields={"data": "second"})
     first.order(publish="/t", fields={"data": "both"})
-    watcher.recorded(103)
+    watcher.recorded(3)
     second.order(destroy="/t")
-    watcher.says("now watched as reliable, transient local")
     first.order(publish="/t", fields={"data": "alone"})
-    watcher.recorded(104)
-    statistics = watcher.stop()
+    watcher.recorded(4)
+    watcher.stop()
     said = [data["data"] for data in data_of(watcher.records, "/t")]
-    assert [word for word in said if word != "second"] == ["latched", *map(str, range(100)), "both", "alone"]
-    assert statistics == {"/t": {"received": 104, "lost": 0, "dropped": 0, "foreign": 0}}
+    assert [word for word in said if word != "second"] == ["latched", "both", "alone"]
 
 
 def test_a_topic_may_appear_late_and_the_domain_may_be_configured(ros: Graph):
