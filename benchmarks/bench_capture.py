@@ -26,7 +26,7 @@ from rosbridge_eth.capture import (
     definition_line,
     parse_line,
 )
-from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 
 
 def messages(topic: str) -> list[RawMessage]:

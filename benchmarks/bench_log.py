@@ -23,8 +23,8 @@ from typing import Any
 from backports import zstd
 from rosbags.highlevel import AnyReader
 
-from rosbridge_eth import chunk as chunks
-from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal, verify
+from rosbridge_eth.log import chunk as chunks
+from rosbridge_eth.log.chunk import Log, content_key, open_lines, robot_id, seal, verify
 from smcrypto import sm2, sm3, sm4
 
 BAG = Path(__file__).resolve().parents[1] / "samples" / "robot_1.bag"

@@ -24,12 +24,12 @@ from eth_hash.auto import keccak
 
 from bridge_costs import POSE_AND_TWIST
 from rosbridge_eth.capture import Capture, TopicRule, parse_line, stream_line
-from rosbridge_eth.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
+from rosbridge_eth.log.chunk import Log, content_key, open_lines, robot_id, seal
 from rosbridge_eth.reading.memo import Memo
 from rosbridge_eth.reading.verify import Facts, Verifier, is_signed
-from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
 START = datetime(2026, 1, 1, tzinfo=UTC)

@@ -40,18 +40,18 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
-from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import Address
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.robot import TAKE, Robot
-from rosbridge_eth.sender import Sender
-from rosbridge_eth.server import Reception, Worker
-from rosbridge_eth.sources import BagSource, Selection
-from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.robot.loop import TAKE, Robot
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.robot.sources import BagSource, Selection
+from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.server.reception import Reception, Worker
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.writer import LogWriter
 
 TOPIC = "/robot_1/odom"
 POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pose", "twist.twist")

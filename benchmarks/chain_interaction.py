@@ -35,10 +35,10 @@ from eth_hash.auto import keccak
 
 import geth_network
 from ports import free_port
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import NOTHING, Receipt, call_gas, set_data_gas
 from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.log.chunk import robot_id
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount

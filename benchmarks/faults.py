@@ -14,7 +14,7 @@ that was ever sealed; its number says how many the stream has.
 letter nor in the spool. `doubled` counts chunks that the chain has more than
 once. Both have to be 0, whatever the fault.
 
-The network between robot and server is a relay (rosbridge_eth.relay) that
+The network between robot and server is a relay (rosbridge_eth.cli.relay) that
 loses, doubles and reorders; `tc netem` needs a kernel with sch_netem.
 """
 
@@ -45,16 +45,16 @@ from pathlib import Path
 import rosbridge_eth
 from ports import free_port
 from rosbridge_eth.capture import Capture, MessageLine, TopicRule, parse_line
-from rosbridge_eth.chunk import Chunk, Header, robot_id
+from rosbridge_eth.cli.relay import Harm, Relay
 from rosbridge_eth.config import load_server_config
-from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Trust, load_identity
 from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.log.chunk import Chunk, Header, robot_id
 from rosbridge_eth.reading import Kind, ProvenRecord, Verdict, read_robot
-from rosbridge_eth.relay import Harm, Relay
-from rosbridge_eth.sources import BagSource, Selection
-from rosbridge_eth.sources.bag import sample_bag
-from rosbridge_eth.supervisor import open_store
+from rosbridge_eth.robot.sources import BagSource, Selection
+from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.server.supervisor import open_store
 
 TOPIC = "/robot_1/odom"
 MESSAGES, PACE = 100, 5  # times as fast as recorded

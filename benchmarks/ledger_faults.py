@@ -46,13 +46,14 @@ import requests
 
 import geth_network
 from ports import free_port
-from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
 from rosbridge_eth.errors import BridgeError
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.inbox.sqlite import SqliteInbox
-from rosbridge_eth.ledger import Keyring, Ledger, submitter
+from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.server import submitter
 from smcrypto import sm2
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")

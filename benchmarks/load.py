@@ -51,17 +51,13 @@ from typing import Any
 
 import geth_network
 from ports import free_port
-from rosbridge_eth import server as door
-from rosbridge_eth.administration import deploy_contract, init_home, load_server_identity, register_robot
-from rosbridge_eth.bundle import Request, read_bundle
 from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Drop
 from rosbridge_eth.channel.protection import Direction
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import load_server_config
+from rosbridge_eth.config.home import OperatorHome, ReaderHome
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.home import OperatorHome, ReaderHome
 from rosbridge_eth.identity import (
     CertificateAuthority,
     Identity,
@@ -74,15 +70,19 @@ from rosbridge_eth.identity import (
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Place, Receipt, call_gas
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
+from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.operator.bundle import Request, read_bundle
+from rosbridge_eth.operator.enrolment import deploy_contract, init_home, load_server_identity, register_robot
+from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import Verifier
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.sender import Sender
-from rosbridge_eth.server import Worker
-from rosbridge_eth.sources import BagSource, Selection
-from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.robot.sources import BagSource, Selection
+from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.server import reception as door
+from rosbridge_eth.server.reception import Worker
+from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.supervisor import open_reception, open_store, open_submitter
-from rosbridge_eth.writer import LogWriter
 from smcrypto import sm2
 
 TOPIC = "/robot_1/odom"

@@ -24,20 +24,14 @@ BESIDE = {".js": "JavaScript", ".mjs": "JavaScript", ".html": "JavaScript", ".lu
 """Languages that are counted beside Python, by a file's ending."""
 
 PARTS = {
-    "cli, demo, doctor, status": ("__main__.py", "cli", "cli.py", "demo.py", "doctor.py", "status.py", "terminal.py"),
-    "config": ("config", "config.py"),
-    "identity, home, registry, bundle, errors": (
-        "identity.py", "home.py", "files.py", "registry.py", "administration.py", "bundle.py", "errors.py",
-        "passphrases.py", "__init__.py",
-    ),
-    "capture": ("capture", "blackbox.py"),
-    "sources": ("sources",),
-    "chunk": ("chunk.py", "writer.py", "protocol.py"),
+    "cli": ("__main__.py", "cli", "terminal.py", "logs.py"),
+    "operator, config, identity, errors": ("operator", "config", "identity.py", "errors.py", "__init__.py"),
+    "capture": ("capture",),
+    "log": ("log",),
     "channel": ("channel",),
-    "spool, inbox": ("spool.py", "database.py", "inbox"),
     "ledger": ("ledger",),
-    "robot, server": ("robot.py", "sender.py", "server.py", "supervisor.py"),
-    "operations": ("metrics.py", "logs.py"),
+    "robot, sources": ("robot",),
+    "server": ("server",),
     "reading": ("reading",),
 }
 """The rows of the design's table, by the first part of a file's path in the bridge's package."""

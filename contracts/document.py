@@ -17,9 +17,9 @@ from eth.vm.forks.prague import PragueVM
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "src"))
 
-from rosbridge_eth.chunk import robot_id  # noqa: E402
 from rosbridge_eth.ledger import Keyring, Ledger  # noqa: E402
 from rosbridge_eth.ledger.nodes import EmbeddedChain  # noqa: E402
+from rosbridge_eth.log.chunk import robot_id  # noqa: E402
 
 PAGE = ROOT / "docs" / "ledger.md"
 PAPER = 268_924  # gas of one record of 256 bytes in the paper's contract

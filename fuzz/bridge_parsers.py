@@ -16,8 +16,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from rosbridge_eth import chunk as chunks
-from rosbridge_eth.chunk import Chunk, ChunkError, Header
+from rosbridge_eth.log import chunk as chunks
+from rosbridge_eth.log.chunk import Chunk, ChunkError, Header
 from rosbridge_eth.protocol import ProtocolError, decode_down, decode_up, encode
 from smcrypto import sm2
 

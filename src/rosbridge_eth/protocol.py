@@ -16,7 +16,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple, TypeAlias
 
-from rosbridge_eth.chunk import MAX_CHUNK
+from rosbridge_eth.log.chunk import MAX_CHUNK
 
 MAX_WHY = 400
 

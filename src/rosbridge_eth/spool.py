@@ -15,9 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from rosbridge_eth.chunk import Chunk, Log
-from rosbridge_eth.database import Database, DiskFull
 from rosbridge_eth.errors import StoreError
+from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.database import Database, DiskFull
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import os
 import struct
 from collections.abc import Iterator
 
-from rosbridge_eth.chunk import Chunk
+from rosbridge_eth.log.chunk import Chunk
 from smcrypto import sm3
 
 STREAM = b"s" * 16

@@ -8,7 +8,7 @@ import time
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Event
 from rosbridge_eth.channel.udp import UdpLoop, client_socket
-from rosbridge_eth.server import Worker
+from rosbridge_eth.server.reception import Worker
 
 PATIENCE = 30.0  # s, until a test gives up
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosbridge_eth.blackbox import OVERHEAD, BlackBox, Condition, Record, Ring, TriggerRule
 from rosbridge_eth.capture import RawMessage, Restoration, Wire, decoder_for, parse_line
 from rosbridge_eth.capture.lines import TriggerLine
 from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.robot.blackbox import OVERHEAD, BlackBox, Condition, Record, Ring, TriggerRule
 
 S = 10**9
 START = 1_700_000_000 * S

@@ -18,10 +18,10 @@ from bridge.operations.conftest import Place, _made, place
 from rosbridge_eth import terminal
 from rosbridge_eth.cli import GROUPS, app, run
 from rosbridge_eth.cli.reader import DAY_NS, _choice_of
+from rosbridge_eth.config.home import OperatorHome
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.ledger.nodes import Anvil, free_port
-from rosbridge_eth.sources import sample_bag
+from rosbridge_eth.robot.sources import sample_bag
 
 __all__ = ["_made", "place"]  # fixtures
 

@@ -21,13 +21,13 @@ from eth_hash.auto import keccak
 from bridge.channel.simulation import Faults, Network
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Event, Server, ServerConfig, cookie_key
-from rosbridge_eth.chunk import Chunk, Log, content_key, drop, open_lines, robot_id, seal
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox.sqlite import SqliteInbox
-from rosbridge_eth.sender import Sender
-from rosbridge_eth.server import HELD, MISMATCH, Reception
+from rosbridge_eth.log.chunk import Chunk, Log, content_key, drop, open_lines, robot_id, seal
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.server.reception import HELD, MISMATCH, Reception
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.writer import LogWriter
 
 BIRTH = datetime(2026, 1, 1, tzinfo=UTC)
 ROBOT_ADDRESS, SERVER_ADDRESS = ("192.0.2.2", 5000), ("192.0.2.1", 7410)

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.capture import MessageLine
-from rosbridge_eth.demo import DemoResult, run_demo
+from rosbridge_eth.cli.demo import DemoResult, run_demo
 from rosbridge_eth.reading import Kind
 from rosbridge_eth.reading.compare import compare
-from rosbridge_eth.robot import Robot
-from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.robot.loop import Robot
+from rosbridge_eth.robot.sources.bag import sample_bag
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPIC = "/robot_1/odom"
@@ -74,8 +74,8 @@ def test_an_incomplete_result_does_not_pass(result: DemoResult) -> None:
 
 
 def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosbridge_eth.robot.RING", 4)  # what is in it when the robot is stopped is captured, too
-    monkeypatch.setattr("rosbridge_eth.robot.TAKE", 1)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.RING", 4)  # what is in it when the robot is stopped is captured, too
+    monkeypatch.setattr("rosbridge_eth.robot.loop.TAKE", 1)
 
     def stop_early(robot: Robot) -> None:
         # Without a session it would stop with everything in its spool, as it should.

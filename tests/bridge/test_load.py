@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import load
-from rosbridge_eth import supervisor
 from rosbridge_eth.channel import ServerConfig
+from rosbridge_eth.server import supervisor
 
 SESSIONS, MESSAGES, WORKERS = 24, 5, 2
 

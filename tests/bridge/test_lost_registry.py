@@ -12,17 +12,17 @@ import pytest
 
 from bridge.home.world import PASSPHRASE, World
 from bridge.machine import PATIENCE, Machine, Running
-from rosbridge_eth import supervisor
-from rosbridge_eth.administration import load_server_identity
-from rosbridge_eth.bundle import join, read_bundle
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import load_server_config
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ExitCode, StoreError
-from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import Trust, load_identity
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.server import Worker
-from rosbridge_eth.supervisor import Secrets, Supervisor, open_reception, open_submitter
+from rosbridge_eth.operator.bundle import join, read_bundle
+from rosbridge_eth.operator.enrolment import load_server_identity
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server import supervisor
+from rosbridge_eth.server.reception import Worker
+from rosbridge_eth.server.supervisor import Secrets, Supervisor, open_reception, open_submitter
 
 
 def take_away(world: World) -> None:

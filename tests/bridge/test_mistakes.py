@@ -24,9 +24,9 @@ from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import load_identity, read_certificates
 from rosbridge_eth.ledger.transport import Node
+from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading.evidence import Asked
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot import open_robot, reader_keys
+from rosbridge_eth.robot.loop import open_robot, reader_keys
 
 __all__ = ["_files", "_made", "place"]  # fixtures
 

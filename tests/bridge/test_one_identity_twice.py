@@ -15,10 +15,10 @@ from bridge.machine import PATIENCE, Machine, Running
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Disconnected, End, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.inbox import RobotState
 from rosbridge_eth.inbox.sqlite import SqliteInbox
-from rosbridge_eth.server import Reception, Worker
+from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.server.reception import Reception, Worker
 
 NOW = datetime.now(UTC) - timedelta(hours=1)
 CA = ids.create_ca("operator", at=NOW)
@@ -97,7 +97,7 @@ def test_a_robot_that_comes_costs_a_look_at_itself_and_not_at_all_the_others(
         asked.append(len(tks))
         return states(inbox, tks)
 
-    monkeypatch.setattr("rosbridge_eth.server.LOOK_EVERY", 1e6)
+    monkeypatch.setattr("rosbridge_eth.server.reception.LOOK_EVERY", 1e6)
     monkeypatch.setattr(SqliteInbox, "states", counted)
     machines = [machine(robot, serving) for robot in ROBOTS]
     assert [count for count in asked if count] == [1, 1]

@@ -20,16 +20,16 @@ from bridge.pages import ROOT, type_page
 from bridge.sources.ros2.graph import free_domain, ros2_python
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth import administration as admin
-from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.config import load_robot_config, load_server_config
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import Anvil
-from rosbridge_eth.sources import sample_bag
-from rosbridge_eth.supervisor import open_store
+from rosbridge_eth.operator import enrolment as admin
+from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
+from rosbridge_eth.robot.sources import sample_bag
+from rosbridge_eth.server.supervisor import open_store
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 WORDS = {"operator": "an operator's passphrase", "reader": "the owner's passphrase", "robot": "a robot's password"}

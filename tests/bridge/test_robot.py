@@ -17,16 +17,16 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
 from rosbridge_eth.channel.udp import server_sockets
-from rosbridge_eth.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.config import Address
-from rosbridge_eth.database import DiskFull
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
+from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.database import DiskFull
+from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
-from rosbridge_eth.robot import MAX_UNSPOOLED, RING, Robot
-from rosbridge_eth.sender import Sender
-from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.loop import MAX_UNSPOOLED, RING, Robot
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from rosbridge_eth.spool import Spool
-from rosbridge_eth.writer import LogWriter
 
 TOPIC = "/robot_1/odom"
 PLACE = Log(bytes(32), robot_id("robot_1"))
@@ -87,8 +87,8 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
         append(chunk)  # type: ignore[arg-type]
 
     monkeypatch.setattr(robot.spool, "append", maybe)
-    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.01)
-    monkeypatch.setattr("rosbridge_eth.robot.LONGEST_WAIT", 0.01)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.SPOOL_AGAIN", 0.01)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.LONGEST_WAIT", 0.01)
     seen: list[int] = []
     turns = 0
 
@@ -147,7 +147,7 @@ def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_
             raise StoreError("a page of it cannot be read")
 
     monkeypatch.setattr(robot.sender, "send", send)
-    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.0)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.SPOOL_AGAIN", 0.0)
 
     def on_turn() -> None:
         if robot.captured == 3000 and not robot._unspooled:
@@ -229,7 +229,7 @@ def test_a_robot_that_is_stopped_tries_the_spool_once_more(
 ) -> None:
     robot = make(100)
     spool = Full(robot, monkeypatch)
-    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 3600)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.SPOOL_AGAIN", 3600)
 
     def on_turn() -> None:
         if robot._unspooled and robot.captured == 100:
@@ -246,7 +246,7 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
     robot = make(1000)
     Full(robot, monkeypatch)
     for name, value in {"LOSSES_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3, "RING": 64}.items():
-        monkeypatch.setattr(f"rosbridge_eth.robot.{name}", value)
+        monkeypatch.setattr(f"rosbridge_eth.robot.loop.{name}", value)
     waiting: list[int] = []
 
     def on_turn() -> None:
@@ -277,7 +277,7 @@ def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
 ) -> None:
     robot = make(100)
     spool, turns = Full(robot, monkeypatch), 0
-    monkeypatch.setattr("rosbridge_eth.robot.SPOOL_AGAIN", 0.0)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.SPOOL_AGAIN", 0.0)
 
     def on_turn() -> None:
         nonlocal turns
@@ -355,7 +355,7 @@ def test_a_live_source_that_dies_ends_the_robot_at_once_though_no_server_is_ther
 def test_what_is_confirmed_of_a_topic_is_what_chunks_up_to_that_place_hold(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, marks: int
 ) -> None:
-    monkeypatch.setattr("rosbridge_eth.robot.MARKS", marks)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.MARKS", marks)
     robot = make(300)
     emit = robot._emit
 

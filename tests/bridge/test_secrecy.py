@@ -19,16 +19,16 @@ import pytest
 from web3 import Web3
 
 from bridge.secrecy import betrayed, leaves
-from rosbridge_eth import demo
 from rosbridge_eth.channel import handshake
 from rosbridge_eth.channel.protection import SessionSecrets
-from rosbridge_eth.chunk import MAX_READERS, Chunk, content_key, robot_id
-from rosbridge_eth.demo import DemoResult, run_demo
+from rosbridge_eth.cli import demo
+from rosbridge_eth.cli.demo import DemoResult, run_demo
+from rosbridge_eth.cli.relay import Harm
 from rosbridge_eth.identity import load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger, nodes
+from rosbridge_eth.log.chunk import MAX_READERS, Chunk, content_key, robot_id
 from rosbridge_eth.logs import LOGGER, TextFormatter
-from rosbridge_eth.relay import Harm
-from rosbridge_eth.sources.bag import sample_bag
+from rosbridge_eth.robot.sources.bag import sample_bag
 from smcrypto import sm2
 
 PLACES = ("network", "chain", "operator's home", "spool", "logs")

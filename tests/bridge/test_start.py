@@ -9,11 +9,11 @@ import pytest
 
 from bridge.home.world import PASSPHRASE, World
 from bridge.redis_server import RedisServer
-from rosbridge_eth import supervisor
-from rosbridge_eth.administration import load_server_identity
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import BridgeError, ChainError, StoreError
-from rosbridge_eth.supervisor import Secrets, Supervisor
+from rosbridge_eth.operator.enrolment import load_server_identity
+from rosbridge_eth.server import supervisor
+from rosbridge_eth.server.supervisor import Secrets, Supervisor
 
 
 @pytest.fixture

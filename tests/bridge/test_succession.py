@@ -14,18 +14,18 @@ from pathlib import Path
 import pytest
 
 from bridge.home.world import READER_PASSPHRASE, TK, World
-from rosbridge_eth.bundle import join, read_bundle
 from rosbridge_eth.capture import stream_line
-from rosbridge_eth.chunk import Chunk, Log
 from rosbridge_eth.config import load_server_config
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import Identity, Role, Trust, load_identity
 from rosbridge_eth.inbox import Outcome
+from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.operator.bundle import join, read_bundle
+from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import Kind, Verdict, read_robot
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.supervisor import open_submitter
-from rosbridge_eth.writer import LogWriter
+from rosbridge_eth.server.supervisor import open_submitter
 
 SERVED = 3.0  # seconds of the server's, for what it has to be written and confirmed
 

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 from bridge.image_bags import bag_of_images
-from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.config.models import BagConfig
 from rosbridge_eth.errors import ExitCode, SourceError
 from rosbridge_eth.ledger.contract import set_data_cost
-from rosbridge_eth.sources import BagSource, sample_bag
-from rosbridge_eth.topics import ANYTHING, robot_toml, survey
+from rosbridge_eth.log.chunk import MAX_READERS
+from rosbridge_eth.robot.sources import BagSource, sample_bag
+from rosbridge_eth.robot.topics import ANYTHING, robot_toml, survey
 
 Capture = pytest.CaptureFixture[str]
 BAG = str(sample_bag())
@@ -108,7 +108,7 @@ def test_the_cost_is_that_of_what_robot_toml_takes(capsys: Capture):
 
 
 def test_every_reader_costs(capsys: Capture):
-    from rosbridge_eth.topics import survey
+    from rosbridge_eth.robot.topics import survey
 
     Path("robot.toml").write_text(robot_toml(["/robot_1/odom"], "sim"))
     config = load_robot_config(Path("robot.toml"))
@@ -131,7 +131,7 @@ def test_the_readers_that_robot_toml_names_are_those_that_cost(capsys: Capture):
 
 
 def test_a_source_that_breaks_ends_the_listening_too(monkeypatch: pytest.MonkeyPatch):
-    from rosbridge_eth.topics import survey
+    from rosbridge_eth.robot.topics import survey
 
     def breaks(source: BagSource, emit: object, stop: object) -> None:
         raise SourceError("the bag is cut off here")

@@ -23,8 +23,8 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import orjson
 
 from rosbridge_eth.capture.messages import Decoder, Wire, decoder_for
-from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import SourceError, VerificationError
+from rosbridge_eth.log.chunk import MAX_LINE
 
 MAX_DEPTH: Final = 100
 """Levels of nesting of a line; definitions of messages are nested less (capture.definitions)."""

@@ -20,8 +20,8 @@ from rosbridge_eth.capture.conversion import Conversion
 from rosbridge_eth.capture.lines import definition_line, lost_line
 from rosbridge_eth.capture.messages import DecodeError, Decoder, RawMessage
 from rosbridge_eth.capture.rules import NamePattern, Schedule, TopicRule, parse_paths, rule_for
-from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.log.chunk import MAX_LINE
 
 MAX_CONVERSIONS: Final = 8
 """Of one topic, for as many types or definitions; a publisher may bring another one with each of its connections."""

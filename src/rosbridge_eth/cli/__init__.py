@@ -15,9 +15,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from rosbridge_eth import demo, doctor, status, topics
-from rosbridge_eth.cli import operator, reader, robot
+from rosbridge_eth.cli import demo, operator, reader, robot
 from rosbridge_eth.errors import BridgeError, ExitCode
+from rosbridge_eth.operator import doctor, status
+from rosbridge_eth.robot import topics
 from rosbridge_eth.terminal import talk
 from smcrypto import __version__
 

@@ -11,17 +11,18 @@ from urllib.parse import urlsplit
 
 import typer
 
-from rosbridge_eth import status, terminal
-from rosbridge_eth.bundle import Request
+from rosbridge_eth import terminal
 from rosbridge_eth.channel.udp import server_sockets
 from rosbridge_eth.config import load_server_config
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.config.values import Address, counted
 from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
-from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
 from rosbridge_eth.logs import LogFormat, log_to_stderr
-from rosbridge_eth.passphrases import read_passphrase
+from rosbridge_eth.operator import status
+from rosbridge_eth.operator.bundle import Request
 from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
@@ -75,7 +76,7 @@ def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring
 
 
 def _inbox(place: OperatorHome) -> Inbox:
-    from rosbridge_eth.supervisor import open_store
+    from rosbridge_eth.server.supervisor import open_store
 
     return open_store(load_server_config(place.config), place)
 
@@ -104,8 +105,8 @@ def up(
 
     What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
     """
-    from rosbridge_eth.administration import deploy_contract, init_home
     from rosbridge_eth.ledger.nodes import Anvil, free_port, is_free
+    from rosbridge_eth.operator.enrolment import deploy_contract, init_home
 
     log_to_stderr(log_format, verbose)
     for number in (signal.SIGTERM, signal.SIGHUP):
@@ -172,8 +173,8 @@ def init(
 
     In the operator's are the CA, the server's identity, and the seed of all accounts.
     """
-    from rosbridge_eth.administration import init_home
     from rosbridge_eth.ledger import Keyring
+    from rosbridge_eth.operator.enrolment import init_home
 
     place = OperatorHome(home)
     passphrase = read_passphrase("operator", "Operator passphrase", file=passphrase_file, confirm=True)
@@ -222,7 +223,7 @@ def deploy(
     passphrase_file: PassphraseFile = None,
 ) -> None:
     """Create the contract on the configured chain."""
-    from rosbridge_eth.administration import deploy_contract
+    from rosbridge_eth.operator.enrolment import deploy_contract
 
     place, _, keys = _opened(home, passphrase_file)
     made = deploy_contract(place, load_server_config(place.config).chain.url, keys, wait=wait)
@@ -241,7 +242,7 @@ def register(
 
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
     """
-    from rosbridge_eth.administration import register_robot
+    from rosbridge_eth.operator.enrolment import register_robot
 
     asked = None if request is None else Request.decode(terminal.read_given(request))
     place, passphrase, keys = _opened(home, passphrase_file)
@@ -281,7 +282,7 @@ def add_reader(
     ca_passphrase_file: _CaPassphraseFile = None, reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
     """Make another reader. Robots that are registered from now on seal for it too."""
-    from rosbridge_eth import administration
+    from rosbridge_eth.operator import enrolment as administration
 
     place, folder = OperatorHome(home).require(), ReaderHome(to or Path(name))
     ca = _ca(place, passphrase_of(place, passphrase_file), ca_passphrase_file)
@@ -300,7 +301,7 @@ def revoke(
     compromised: _CompromisedOption = False, passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
     """Revoke a name. The server closes its session at once, and the chain takes nothing from it any more."""
-    from rosbridge_eth import administration
+    from rosbridge_eth.operator import enrolment as administration
 
     place, _, keys = _opened(home, passphrase_file)
     with ledger_of(place, check=False) as ledger:  # the server is told even where the node is away
@@ -318,7 +319,7 @@ def renew(
     ca_passphrase_file: _CaPassphraseFile = None,
 ) -> None:  # fmt: skip
     """Give the server new keys, before the certificates expire. Then start the server again."""
-    from rosbridge_eth.administration import renew_server
+    from rosbridge_eth.operator.enrolment import renew_server
 
     place = OperatorHome(home).require()
     passphrase = passphrase_of(place, passphrase_file)
@@ -358,7 +359,7 @@ def backup(
     target: Annotated[Path, typer.Argument(help="A new folder.")], home: terminal.AnyHomeOption = OPERATOR_HOME
 ) -> None:
     """Copy a home, in use or not, into a new folder. Keep it where its keys are safe."""
-    from rosbridge_eth import administration
+    from rosbridge_eth.operator import enrolment as administration
 
     administration.backup(home, target)
     talk(f"{target} is a copy of {home}.")
@@ -369,7 +370,7 @@ def passwd(
     new_passphrase_file: Annotated[Path | None, typer.Option(help="The new one, on the first line.")] = None,
 ) -> None:  # fmt: skip
     """Put the keys of a home under another passphrase."""
-    from rosbridge_eth.administration import change_passphrase
+    from rosbridge_eth.operator.enrolment import change_passphrase
 
     old = read_passphrase("present", "Present passphrase", file=passphrase_file)
     new = read_passphrase("new", "New passphrase", file=new_passphrase_file, confirm=True)
@@ -393,8 +394,8 @@ def _serve(
     look: Callable[[], None] = lambda: None,
 ) -> None:  # fmt: skip
     """Run the server, with so many workers, else as server.toml says; what `look` raises ends it in good order."""
-    from rosbridge_eth.administration import load_server_identity
-    from rosbridge_eth.supervisor import Secrets, Supervisor
+    from rosbridge_eth.operator.enrolment import load_server_identity
+    from rosbridge_eth.server.supervisor import Secrets, Supervisor
 
     config = load_server_config(place.config)
     secrets = Secrets(load_server_identity(place, passphrase), keys)

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
 import typer
 
 from rosbridge_eth.config import load_reader_config
+from rosbridge_eth.config.home import ReaderHome
+from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.config.values import Address, counted, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
-from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.identity import Identity, Role, Trust, load_identity, public_identity, read_certificates
-from rosbridge_eth.passphrases import read_passphrase
 from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading, Verdict, read_robot
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk

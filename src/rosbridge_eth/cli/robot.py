@@ -19,23 +19,23 @@ import typer
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from rosbridge_eth import bundle as bundles
 from rosbridge_eth import terminal
 from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
+from rosbridge_eth.config.home import RobotHome, require_empty
 from rosbridge_eth.config.models import BagConfig, SimConfig
+from rosbridge_eth.config.passphrases import read_passphrase, warn_if_others_read
 from rosbridge_eth.errors import ConfigError, StoreError
-from rosbridge_eth.home import RobotHome, require_empty
 from rosbridge_eth.identity import check_name
 from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
-from rosbridge_eth.passphrases import read_passphrase, warn_if_others_read
+from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.sources import Offer
+from rosbridge_eth.robot.sources import Offer
+from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
 from rosbridge_eth.terminal import errors, live, plain, table, talk
-from rosbridge_eth.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
 
 if TYPE_CHECKING:
-    from rosbridge_eth.metrics import Rates
-    from rosbridge_eth.robot import Robot
+    from rosbridge_eth.robot.loop import Robot
+    from rosbridge_eth.server.metrics import Rates
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
@@ -154,9 +154,9 @@ def robot(
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
-    from rosbridge_eth import metrics
-    from rosbridge_eth.robot import open_robot, read_again
-    from rosbridge_eth.supervisor import Beats, notify
+    from rosbridge_eth.robot.loop import open_robot, read_again
+    from rosbridge_eth.server import metrics
+    from rosbridge_eth.server.supervisor import Beats, notify
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
@@ -223,7 +223,7 @@ def trigger(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
 ) -> None:
     """Have the robot write what it keeps in memory for an event. It runs with this home; the event is now."""
-    from rosbridge_eth import metrics
+    from rosbridge_eth.server import metrics
 
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")

@@ -16,16 +16,16 @@ from pydantic import (  # isort: skip
 )  # fmt: skip
 from pydantic import model_validator as validator
 
-from rosbridge_eth.blackbox import Condition, TriggerRule
 from rosbridge_eth.capture import NamePattern, TopicRule
 from rosbridge_eth.capture.rules import parse_paths
-from rosbridge_eth.chunk import MAX_READERS
+from rosbridge_eth.config.home import ledger_of
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.home import ledger_of
+from rosbridge_eth.log.chunk import MAX_READERS
+from rosbridge_eth.robot.blackbox import Condition, TriggerRule
 
 if TYPE_CHECKING:
-    from rosbridge_eth.sources import Selection
+    from rosbridge_eth.robot.sources import Selection
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
 
@@ -415,7 +415,7 @@ class RobotConfig(Section):
 
     def selection(self) -> Selection:
         """For sources.open_source."""
-        from rosbridge_eth.sources import Selection
+        from rosbridge_eth.robot.sources import Selection
 
         return Selection([topic.topic for topic in self.topics], self.nodes)
 

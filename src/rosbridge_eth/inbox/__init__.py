@@ -15,8 +15,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
-from rosbridge_eth.chunk import Chunk
 from rosbridge_eth.errors import StoreError
+from rosbridge_eth.log.chunk import Chunk
 
 DEAD_LETTERS: Final = 1000
 """Dead letters that are kept; the oldest go."""

@@ -25,10 +25,10 @@ from redis.backoff import NoBackoff
 from redis.connection import parse_url
 from redis.retry import Retry
 
-from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.database import NothingThere
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import DEAD_LETTERS, DeadLetter, Head, Inbox, InboxExchanged, Outcome, Row, Waiting
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.database import NothingThere
 
 _OUTCOMES: Final = {"S": Outcome.STORED, "K": Outcome.KNOWN, "D": Outcome.DIFFERENT, "F": Outcome.FULL}
 _ROW: Final = struct.Struct(">32s32s24sIIdQQQ")  # see `log` in redis.lua

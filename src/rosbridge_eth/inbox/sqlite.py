@@ -9,10 +9,10 @@ from typing import Any, Final
 
 from eth_hash.auto import keccak
 
-from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.database import Database, NothingThere
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import DEAD_LETTERS, DeadLetter, Head, Inbox, InboxExchanged, Outcome, Row, Waiting
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.database import Database, NothingThere
 
 _APPLICATION: Final = 0x52424942  # "RBIB"
 _NOWHERE: Final = -(2**63)  # a position before all rows

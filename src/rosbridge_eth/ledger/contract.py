@@ -19,10 +19,10 @@ from functools import cache, cached_property
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
-from rosbridge_eth.chunk import ledger_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import transport
 from rosbridge_eth.ledger.transport import AlreadyKnown, Node, NonceTooLow, TooMuch, Underpriced, bytes32, natural
+from rosbridge_eth.log.chunk import ledger_id
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount

@@ -28,7 +28,7 @@ from rosbridge_eth.capture.definitions import attribute_name
 from rosbridge_eth.config.values import counted, time_text
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.reading.verify import Choice
-from rosbridge_eth.sources import BagSource, Selection
+from rosbridge_eth.robot.sources import BagSource, Selection
 from smcrypto import sm3
 
 MAX_DIFFERENCES = 100

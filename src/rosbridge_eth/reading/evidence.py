@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rosbridge_eth.capture import MessageLine, parse_line
 
-from rosbridge_eth.chunk import (  # isort: skip
+from rosbridge_eth.log.chunk import (  # isort: skip
     Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id, verify_signature,
 )  # fmt: skip
 from rosbridge_eth.config.values import counted, time_text

@@ -8,9 +8,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
+from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.reading.memo import Memo
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind, Links, Progress, Verdict, shown
 from rosbridge_eth.reading.verify import EVERYTHING, Choice, ProvenChunk, ProvenRecord, Verifier, digest_of

@@ -17,9 +17,9 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import AwareDatetime, BaseModel, StringConstraints
 
-from rosbridge_eth.chunk import KEY_SIZE, Chunk, Malformed
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust, public_identity, sign, verify
+from rosbridge_eth.log.chunk import KEY_SIZE, Chunk, Malformed
 from rosbridge_eth.reading.fetch import Reading
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.reading.verify import Choice

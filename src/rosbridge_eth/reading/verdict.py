@@ -20,10 +20,10 @@ import numpy
 from pydantic import BaseModel, Field, StringConstraints
 
 from rosbridge_eth.capture import TypeLine
-from rosbridge_eth.chunk import Log
 from rosbridge_eth.config.values import counted, duration_text, time_text
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.files import write_atomically
+from rosbridge_eth.log.chunk import Log
 from smcrypto import sm2
 
 MAX_FINDINGS: Final = 500

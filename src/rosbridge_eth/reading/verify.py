@@ -18,7 +18,7 @@ from eth_hash.auto import keccak
 
 from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line
 
-from rosbridge_eth.chunk import (  # isort: skip
+from rosbridge_eth.log.chunk import (  # isort: skip
     Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id,
     verify_signature,
 )  # fmt: skip

@@ -25,8 +25,8 @@ from rosbridge_eth.capture import (
     trigger_line,
 )
 from rosbridge_eth.capture.definitions import MAX_KEPT
-from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import VerificationError
+from rosbridge_eth.log.chunk import MAX_LINE
 
 LINE = (
     '{"topic":"/robot_1/odom","type":"nav_msgs/msg/Odometry","source":"ros1","received_ns":1795226223226026342,'

@@ -19,8 +19,8 @@ from rosbridge_eth.capture import (
     parse_line,
 )
 from rosbridge_eth.capture.process import MAX_CONVERSIONS
-from rosbridge_eth.chunk import MAX_LINE
 from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.log.chunk import MAX_LINE
 
 NUMBER = decoder_for(Wire.ROS1, "pkg/Number", "int32 x")
 BLOB = decoder_for(Wire.ROS1, "pkg/Blob", "uint8[] data\nint32 x")

@@ -10,7 +10,6 @@ from pydantic import BaseModel
 
 from rosbridge_eth import config as config_package
 from rosbridge_eth.capture import TopicRule
-from rosbridge_eth.chunk import MAX_READERS, ledger_id
 from rosbridge_eth.config import (
     ReaderConfig,
     RobotConfig,
@@ -22,6 +21,7 @@ from rosbridge_eth.config import (
 )
 from rosbridge_eth.config.models import SOURCE_KINDS
 from rosbridge_eth.errors import ConfigError
+from rosbridge_eth.log.chunk import MAX_READERS, ledger_id
 
 S = 10**9
 FILE = Path("/etc/rosbridge/robot.toml")

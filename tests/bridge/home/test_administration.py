@@ -17,18 +17,18 @@ from pathlib import Path
 import pytest
 
 from bridge.home.world import NOW, PASSPHRASE, READER_PASSPHRASE, TK, World
-from rosbridge_eth import administration as admin
 from rosbridge_eth import identity as ids
-from rosbridge_eth.bundle import join, needs_password, read_bundle
 from rosbridge_eth.config import Address, load_reader_config, load_server_config
+from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
-from rosbridge_eth.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
 from rosbridge_eth.inbox import open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable
-from rosbridge_eth.registry import Registry
+from rosbridge_eth.operator import enrolment as admin
+from rosbridge_eth.operator.bundle import join, needs_password, read_bundle
+from rosbridge_eth.operator.registry import Registry
 from smcrypto import x509
 
 
@@ -559,7 +559,7 @@ def test_a_crash_between_any_two_steps_is_mended_by_doing_it_again(
         if step.startswith("ledger."):
             patched.setattr(world.ledger, step.removeprefix("ledger."), crash)
         else:
-            patched.setattr(f"rosbridge_eth.administration.{step}", crash)
+            patched.setattr(f"rosbridge_eth.operator.enrolment.{step}", crash)
         with pytest.raises(KeyboardInterrupt):
             world.register(replace=True, compromised=True)
     world.number = 50

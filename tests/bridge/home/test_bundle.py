@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle, take_up
 from rosbridge_eth.cli.robot import _say_who
 from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.config.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.errors import ConfigError, IdentityError
-from rosbridge_eth.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.identity import Role, load_identity
-from rosbridge_eth.robot import reader_keys
+from rosbridge_eth.operator.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle, take_up
+from rosbridge_eth.robot.loop import reader_keys
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 CA, OTHER_CA = (ids.create_ca("CA", at=NOW - timedelta(days=1000)) for _ in range(2))

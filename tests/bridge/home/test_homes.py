@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.chunk import ledger_id
-from rosbridge_eth.errors import ChainError, ConfigError
-from rosbridge_eth.home import (
+from rosbridge_eth.config.home import (
     Deployment,
     HomeKind,
     OperatorHome,
@@ -20,6 +18,8 @@ from rosbridge_eth.home import (
     new_home,
     require_empty,
 )
+from rosbridge_eth.errors import ChainError, ConfigError
+from rosbridge_eth.log.chunk import ledger_id
 
 DEPLOYMENT = Deployment(31337, "0x" + "11" * 32, "0x" + "aB" * 20, 7)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.errors import IdentityError
-from rosbridge_eth.passphrases import read_passphrase
 
 
 def test_the_first_line_of_the_file_is_the_passphrase(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_the_end_of_input_at_a_terminal_says_the_same(typed: list[str]) -> None:
     """Ctrl-D at the first prompt, and at the second: what is raised by a process whose input is a terminal."""
     script = (
         "from rosbridge_eth.errors import IdentityError\n"
-        "from rosbridge_eth.passphrases import read_passphrase\n"
+        "from rosbridge_eth.config.passphrases import read_passphrase\n"
         "try: read_passphrase('operator', 'Operator passphrase', environment={}, confirm=True)\n"
         "except IdentityError as error: print('SAID', error)\n"
     )

@@ -9,10 +9,10 @@ import pytest
 from eth_hash.auto import keccak
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import IdentityError, StoreError
 from rosbridge_eth.identity import PeerIdentity, Role, create_ca
-from rosbridge_eth.registry import Registry
+from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.operator.registry import Registry
 
 NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from bridge.home.world import PASSPHRASE, READER_PASSPHRASE, World
-from rosbridge_eth import chunk as chunks
-from rosbridge_eth.bundle import join, read_bundle
-from rosbridge_eth.home import RobotHome
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.identity import KEY_FILES, Role, load_identity, public_identity
+from rosbridge_eth.log import chunk as chunks
+from rosbridge_eth.operator.bundle import join, read_bundle
 from smcrypto import SMCryptoError, sm2
 
 PASSWORD = b"robot's"

@@ -11,14 +11,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbridge_eth import administration as admin
-from rosbridge_eth.bundle import Request, ask_to_join
-from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
-from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Role, load_ca
 from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.operator import enrolment as admin
+from rosbridge_eth.operator.bundle import Request, ask_to_join
 from smcrypto import sm2
 
 PASSPHRASE, READER_PASSPHRASE, NOW = b"operator's", b"reader's", datetime(2026, 6, 1, 12, tzinfo=UTC)

@@ -17,10 +17,10 @@ from web3 import Web3
 
 from bridge.chunks import STREAM, chain, chunk, dropped
 from bridge.inbox.backends import BACKENDS, PLENTY, Backend
-from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.database import NothingThere
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import DEAD_LETTERS, Head, Inbox, InboxExchanged, Outcome, RobotState, Row, Waiting
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.database import NothingThere
 
 A, B = b"a" * 32, b"b" * 32
 OTHER = bytes(16)  # sorts before STREAM

@@ -20,11 +20,11 @@ import redis
 
 from bridge.chunks import STREAM, chain, chunk, dropped
 from bridge.redis_server import DURABLE, RedisServer
-from rosbridge_eth.chunk import Chunk
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import InboxExchanged, Outcome
 from rosbridge_eth.inbox import redis as redis_inbox
 from rosbridge_eth.inbox.redis import COMMANDS, RedisInbox
+from rosbridge_eth.log.chunk import Chunk
 
 A, B = b"a" * 32, b"b" * 32
 STORED, KNOWN = Outcome.STORED, Outcome.KNOWN

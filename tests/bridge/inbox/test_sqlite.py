@@ -13,11 +13,11 @@ import pytest
 
 from bridge import disks
 from bridge.chunks import STREAM, chain, chunk
-from rosbridge_eth.chunk import Chunk
-from rosbridge_eth.database import DiskFull
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.inbox import InboxExchanged, Outcome
 from rosbridge_eth.inbox.sqlite import SqliteInbox
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.database import DiskFull
 
 A = b"a" * 32
 PLENTY = 1 << 30

@@ -19,12 +19,12 @@ import ledger_faults
 from bridge.ledger.world import ETH, KEYS, World
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.ledger import Ledger, nodes
 from rosbridge_eth.ledger.contract import NOTHING, Fees
 from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.ledger.transport import AlreadyKnown, NonceTooLow, OutOfFunds, Reverted, Underpriced
+from rosbridge_eth.log.chunk import robot_id
 
 pytestmark = pytest.mark.service
 

@@ -13,13 +13,13 @@ from eth.vm.forks import LondonVM, PragueVM
 from eth_hash.auto import keccak
 
 from bridge.ledger.world import ETH, KEYS
-from rosbridge_eth.chunk import robot_id
+from rosbridge_eth.config.home import Deployment
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.home import Deployment
 from rosbridge_eth.ledger import Ledger, RegistrationEvent, contract
 from rosbridge_eth.ledger.contract import NOTHING, Standing, artifact, set_data_cost, set_data_gas
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted, Underpriced
+from rosbridge_eth.log.chunk import robot_id
 
 OPERATOR, ROBOT, OTHER = KEYS.operator, KEYS.robot(1), KEYS.robot(2)
 TK, OTHER_TK = robot_id("robot_1"), robot_id("robot_2")

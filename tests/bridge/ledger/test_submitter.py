@@ -13,8 +13,8 @@ from bridge.ledger.model_chain import ETH, GWEI
 from bridge.ledger.world import KEYS, Pen, World
 from rosbridge_eth.inbox import Head, InboxExchanged, Outcome
 from rosbridge_eth.ledger.contract import Fees
-from rosbridge_eth.ledger.submitter import ALL, BATCH_BYTES, IN_FLIGHT, PATIENCE, Submitter
 from rosbridge_eth.ledger.transport import Underpriced
+from rosbridge_eth.server.submitter import ALL, BATCH_BYTES, IN_FLIGHT, PATIENCE, Submitter
 
 ROBOT, OPERATOR = KEYS.robot(1).address, KEYS.operator.address
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from bridge.ledger.model_chain import ModelChain
-from rosbridge_eth.chunk import Chunk, Log, robot_id, seal
 from rosbridge_eth.inbox import Outcome
 from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring
-from rosbridge_eth.ledger.submitter import Settings, Submitter
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.server.submitter import Settings, Submitter
 from smcrypto import sm2
 
 ETH = 10**18

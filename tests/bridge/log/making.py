@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rosbridge_eth import identity
-from rosbridge_eth.chunk import Chunk, Header, Log, ledger_id, proofs, robot_id, seal
+from rosbridge_eth.log.chunk import Chunk, Header, Log, ledger_id, proofs, robot_id, seal
 from smcrypto import sm2, sm3, sm4
 
 LOG = Log(ledger_id(1337, b"g" * 32, b"c" * 20), robot_id("robot_1"))

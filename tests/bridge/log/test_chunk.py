@@ -24,8 +24,9 @@ from bridge.log.making import (
     sealed,
     signed,
 )
-from rosbridge_eth import chunk as chunks
-from rosbridge_eth.chunk import (
+from rosbridge_eth.errors import BridgeError, ExitCode
+from rosbridge_eth.log import chunk as chunks
+from rosbridge_eth.log.chunk import (
     MAX_BODY,
     MAX_CHUNK,
     MAX_LINE,
@@ -49,7 +50,6 @@ from rosbridge_eth.chunk import (
     verify,
     zstd,
 )
-from rosbridge_eth.errors import BridgeError, ExitCode
 from smcrypto import sm2, sm3
 
 lines_strategy = st.lists(

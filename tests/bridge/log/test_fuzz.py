@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bridge.log.making import sealed
-from rosbridge_eth.chunk import zstd
+from rosbridge_eth.log.chunk import zstd
 from rosbridge_eth.protocol import Confirmed, Hold, Offer, Refused, Stored, Where, encode
 
 PATH = Path(__file__).resolve().parents[3] / "fuzz" / "bridge_parsers.py"

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.log.making import LINES, READER, sealed
-from rosbridge_eth.chunk import MAX_RECORDS, Altered, Proof, check_proof, content_key, proofs
+from rosbridge_eth.log.chunk import MAX_RECORDS, Altered, Proof, check_proof, content_key, proofs
 from smcrypto import sm3
 
 KEY = b"k" * 16

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rosbridge_eth.chunk import MAX_CHUNK
+from rosbridge_eth.log.chunk import MAX_CHUNK
 from rosbridge_eth.protocol import (
     MAX_WHY,
     Confirmed,

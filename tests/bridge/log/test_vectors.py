@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import pytest
 
 from bridge.log.test_proof import path, tree_hash
-from rosbridge_eth.chunk import (
+from rosbridge_eth.log.chunk import (
     Chunk,
     Forged,
     Log,

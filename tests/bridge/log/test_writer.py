@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bridge.log.making import LOG, READER, ROBOT, repeating
-from rosbridge_eth.chunk import (
+from rosbridge_eth.log.chunk import (
     MAX_BODY,
     MAX_LINE,
     MAX_RECORDS,
@@ -24,7 +24,7 @@ from rosbridge_eth.chunk import (
     open_lines,
     verify,
 )
-from rosbridge_eth.writer import MAX_JSON, LogWriter
+from rosbridge_eth.log.writer import MAX_JSON, LogWriter
 from smcrypto import sm2
 
 STREAM_LINE = b'{"stream":{"source":"sim"}}'
@@ -190,9 +190,9 @@ def test_a_definition_is_said_again_where_publishers_disagree_about_it():
 
 def test_a_new_stream_says_its_start_and_definitions_again_and_takes_the_lines_that_wait():
     made = writer()
-    first = made.stream
     made.add(message(0), 0.0, ("A", b"type A"))
     (sealed,) = made.closed(1.0, 0)
+    first = made.stream
     made.add(message(1), 1.0, ("A", b"type A"))
     made.new_stream()
     made.add(message(2), 1.1, ("A", b"type A"))
@@ -200,6 +200,17 @@ def test_a_new_stream_says_its_start_and_definitions_again_and_takes_the_lines_t
     assert made.stream == chunk.header.stream != first == sealed.header.stream
     assert read(chunk) == (STREAM_LINE, b"type A", message(1), message(2))
     check_links([sealed, chunk])
+
+
+def test_streams_are_named_by_their_time_and_always_above_the_one_known():
+    made = writer(newest=(5_000).to_bytes(8, "big") + bytes(8))
+    [first] = made.closed(1.0, 7_000)
+    made.new_stream()
+    [second] = made.closed(2.0, 3_000)  # the clock was put back
+    made.new_stream()
+    [third] = made.closed(3.0, 9_000)
+    times = [int.from_bytes(one.header.stream[:8], "big") for one in (first, second, third)]
+    assert times == [7_000, 7_001, 9_000] and len({one.header.stream[8:] for one in (first, second, third)}) == 3
 
 
 def test_a_new_stream_with_nothing_to_say_still_begins():

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from rosbridge_eth import administration as admin
-from rosbridge_eth.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import Address, load_server_config
-from rosbridge_eth.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.server import Worker
-from rosbridge_eth.supervisor import open_reception, open_store
+from rosbridge_eth.operator import enrolment as admin
+from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server.reception import Worker
+from rosbridge_eth.server.supervisor import open_reception, open_store
 
 PASSPHRASE, PASSWORD, READERS = b"the operator's own words", b"the robot's own words", b"the reader's own words"
 NODE = "http://user:node-key@127.0.0.1:9/v1/path-key?token=query-key"

@@ -18,12 +18,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.lone_robot import PASSWORD, READER, chunks_of, command, environment, lines_of, lone_robot
 from bridge.sources.ros1.graph import Graph, eventually
-from rosbridge_eth import metrics
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ConfigError, ExitCode
-from rosbridge_eth.home import RobotHome
-from rosbridge_eth.robot import Robot, open_robot
+from rosbridge_eth.robot.loop import Robot, open_robot
+from rosbridge_eth.server import metrics
 
 S = 10**9
 START = 1_700_000_000 * S

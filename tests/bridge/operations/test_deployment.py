@@ -14,8 +14,8 @@ import typer.main
 
 from rosbridge_eth.cli import app
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.metrics import REGISTRY
-from rosbridge_eth.sources.ros1.source import MAX_CONNECTIONS
+from rosbridge_eth.robot.sources.ros1.source import MAX_CONNECTIONS
+from rosbridge_eth.server.metrics import REGISTRY
 
 ROOT = Path(__file__).resolve().parents[3]
 UNITS = sorted((ROOT / "deploy/systemd").glob("*.service"))
@@ -94,7 +94,7 @@ def test_every_rule_is_on_the_page_and_asks_for_metrics_and_labels_that_exist():
 
 
 def test_the_conditions_that_rules_ask_for_are_said_by_the_program():
-    source = (ROOT / "src/rosbridge_eth/metrics.py").read_text()
+    source = (ROOT / "src/rosbridge_eth/server/metrics.py").read_text()
     for condition in re.findall(r'condition\{name="([^"]+)"\}', RULES):
         assert f'CONDITION.labels("{condition}")' in source
     assert 'CONDITION.labels(f"{process} stores chunks")' in source

@@ -21,19 +21,19 @@ from bridge.chunks import chain as chunk_chain
 from bridge.disks import fill_up, small_disk
 from bridge.operations.conftest import NODE_SECRETS, PASSPHRASE, Place
 from bridge.redis_server import DURABLE, RedisServer
-from rosbridge_eth import administration as admin
-from rosbridge_eth import doctor as checks
 from rosbridge_eth import identity as ids
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import RobotHome
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.sources import Offer
+from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.operator import doctor as checks
+from rosbridge_eth.operator import enrolment as admin
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.robot.sources import Offer
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -192,8 +192,8 @@ def test_a_live_graph_is_given_the_time_to_be_found(place: Place, monkeypatch: P
         return [*last]
 
     graph = SimpleNamespace(live=True, offers=offers, close=lambda: None)
-    monkeypatch.setattr("rosbridge_eth.sources.open_source", lambda settings, selection: graph)
-    monkeypatch.setattr("rosbridge_eth.topics.SETTLED", 0.01)
+    monkeypatch.setattr("rosbridge_eth.robot.sources.open_source", lambda settings, selection: graph)
+    monkeypatch.setattr("rosbridge_eth.robot.topics.SETTLED", 0.01)
     place.robot.config.write_text(f'{ODOM}[source]\nkind = "ros2"\n')
     _, findings = doctor(capsys, "--home", "robot")
     assert of(findings, "source")["result"] == "ok" and "1 topics" in of(findings, "source")["found"]

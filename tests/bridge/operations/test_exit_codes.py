@@ -14,14 +14,14 @@ import pytest
 
 from bridge.chunks import chain as chunk_chain
 from bridge.operations.conftest import PASSWORD, Place
-from rosbridge_eth import chunk
 from rosbridge_eth.capture import Capture, TopicRule
-from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.identity import load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.log import chunk
+from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from smcrypto import sm2
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "operations.md"
@@ -105,8 +105,8 @@ def triggered(place: Place, keys: Keyring) -> None:
     program = """
 import sys, time
 from pathlib import Path
-from rosbridge_eth import metrics
-from rosbridge_eth.home import RobotHome
+from rosbridge_eth.server import metrics
+from rosbridge_eth.config.home import RobotHome
 place = RobotHome(Path("robot"))
 with metrics.shared(place.path):
     metrics.FIRED.labels("robot_1", "crash").set(0)

@@ -10,12 +10,12 @@ import pytest
 
 from bridge.operations.conftest import PASSPHRASE, READERS, Place
 from bridge.operations.test_exit_codes import READER, STREAM_LINE, replayed, written
-from rosbridge_eth import administration as admin
 from rosbridge_eth.cli import run
+from rosbridge_eth.config.home import ReaderHome
 from rosbridge_eth.config.values import time_text
-from rosbridge_eth.home import ReaderHome
 from rosbridge_eth.identity import load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.operator import enrolment as admin
 
 SPAN = ("--from", "2026-11-01T00:00:00Z", "--to", "2027-01-01T00:00:00Z")
 INSURER = ("read", "robot_1", "--home", "insurer", *READER)

@@ -15,7 +15,7 @@ import pytest
 from bridge.lone_robot import CA, NOW, READER, chunks_of, command, environment, lines_of, lone_robot
 from bridge.sources.ros1.graph import Graph, eventually
 from rosbridge_eth import identity as ids
-from rosbridge_eth.home import RobotHome
+from rosbridge_eth.config.home import RobotHome
 
 LATE = ids.enrol(CA, ids.Role.READER, "late", at=NOW)
 

@@ -16,7 +16,7 @@ import pytest
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.logs import LogFormat, Trouble, log_to_stderr, speaks_json
 
-log = logging.getLogger("rosbridge_eth.server")
+log = logging.getLogger("rosbridge_eth.server.reception")
 
 
 @pytest.fixture(autouse=True)

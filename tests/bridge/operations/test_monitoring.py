@@ -34,7 +34,7 @@ from ruamel.yaml import YAML
 
 from bridge.operations.test_deployment import parse
 from ports import free_port
-from rosbridge_eth.metrics import REGISTRY
+from rosbridge_eth.server.metrics import REGISTRY
 
 ROOT = Path(__file__).resolve().parents[3]
 DEPLOY = ROOT / "deploy"

@@ -21,10 +21,10 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from bridge.secrecy import betrayed, leaves
 from ports import free_port
+from rosbridge_eth.config.home import OperatorHome
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import OperatorHome
 from rosbridge_eth.ledger.nodes import Anvil
-from rosbridge_eth.sources import sample_bag
+from rosbridge_eth.robot.sources import sample_bag
 
 ROOT = Path(__file__).resolve().parents[3]
 PASSPHRASE, PASSWORD, READERS = "operators-words-4711", "robots-words-0815", "readers-words-2342"

@@ -17,17 +17,17 @@ from rich.console import Console
 from bridge import disks
 from bridge.lone_robot import CA, NOW, READER, lone_robot
 from bridge.operations.conftest import PASSWORD, Place
-from rosbridge_eth import metrics
-from rosbridge_eth import robot as module
 from rosbridge_eth.capture import process
 from rosbridge_eth.channel import ClientConfig, Connected, HandshakeFailed, Reason
-from rosbridge_eth.chunk import MAX_READERS
 from rosbridge_eth.cli.robot import _picture
 from rosbridge_eth.config import Address, load_robot_config
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot import Robot, open_robot, reader_keys
-from rosbridge_eth.sources import sample_bag
+from rosbridge_eth.log.chunk import MAX_READERS
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.robot import loop as module
+from rosbridge_eth.robot.loop import Robot, open_robot, reader_keys
+from rosbridge_eth.robot.sources import sample_bag
+from rosbridge_eth.server import metrics
 
 NO_SERVER = 'server = "127.0.0.1:9"\n'
 BAG = '[source]\nkind = "bag"\npath = "BAG"\nspeed = "max"\n'

@@ -18,18 +18,19 @@ from bridge.chunks import chain as chunk_chain
 from bridge.chunks import dropped
 from bridge.operations.conftest import NODE_SECRETS, PASSWORD, Place
 from bridge.redis_server import RedisServer
-from rosbridge_eth import doctor, metrics
-from rosbridge_eth import status as module
-from rosbridge_eth.chunk import robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.errors import BridgeError, ExitCode
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
-from rosbridge_eth.registry import Registry
-from rosbridge_eth.robot import open_robot
-from rosbridge_eth.status import span
-from rosbridge_eth.supervisor import open_submitter
+from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.operator import doctor
+from rosbridge_eth.operator import status as module
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.operator.status import span
+from rosbridge_eth.robot.loop import open_robot
+from rosbridge_eth.server import metrics
+from rosbridge_eth.server.supervisor import open_submitter
 
 TK = robot_id("robot_1")
 STREAM = b"s" * 16

@@ -17,14 +17,13 @@ import pytest
 
 import rosbridge_eth
 from bridge.operations.conftest import Place
-from rosbridge_eth import metrics, supervisor
 from rosbridge_eth.channel.udp import server_sockets
-from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.errors import ExitCode, NetworkError, ProcessError, StoreError
-from rosbridge_eth.spool import Spool
-from rosbridge_eth.supervisor import (
+from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.server import metrics, supervisor
+from rosbridge_eth.server.supervisor import (
     GIVE_UP_AFTER,
     LONGEST_PAUSE,
     MONITOR,
@@ -35,6 +34,7 @@ from rosbridge_eth.supervisor import (
     notify,
     worker_name,
 )
+from rosbridge_eth.spool import Spool
 
 Pause = Callable[[str, int | None, float], float]
 
@@ -163,7 +163,7 @@ def test_the_service_manager_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 CHILD = """
 import os, signal, sys, time
-from rosbridge_eth import supervisor
+from rosbridge_eth.server import supervisor
 parent = supervisor.Supervisor.__new__(supervisor.Supervisor)
 parent._pid = os.getpid()
 signal.signal(signal.SIGTERM, lambda number, frame: print("the parent's own", flush=True))

@@ -19,10 +19,10 @@ import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from rosbridge_eth import metrics
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.metrics import Web
+from rosbridge_eth.server import metrics
+from rosbridge_eth.server.metrics import Web
 
 SLOW = 16
 

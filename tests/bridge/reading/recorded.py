@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bridge.reading.world import NAME, START, Pen, authority, message, reader, robot
-from rosbridge_eth.chunk import Chunk, Log, robot_id
 from rosbridge_eth.identity import Role, Trust, enrol
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.reading import Choice, read_robot
 from rosbridge_eth.reading.evidence import Evidence, make
 from smcrypto.x509 import Certificate

@@ -27,9 +27,9 @@ from bridge.reading.world import (
     robot,
     standing,
 )
-from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import BridgeError, ConfigError
 from rosbridge_eth.files import write_atomically
+from rosbridge_eth.log.chunk import Log
 from rosbridge_eth.reading import verdict
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind
 

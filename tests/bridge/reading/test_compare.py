@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer
 from bridge.image_bags import CAMERA, CLOUD, IMAGES, JPEG, STORE, bag_of_images
 from rosbridge_eth.capture import Capture, MessageLine, RawMessage, TopicRule, Wire, decoder_for, parse_line
 from rosbridge_eth.reading.compare import MAX_DIFFERENCES, Comparison, compare, time_of
-from rosbridge_eth.sources import BagSource, Selection
+from rosbridge_eth.robot.sources import BagSource, Selection
 
 T0, STEP = 1_763_690_000_000_000_000, 100_000_000
 DEFINITION = "int64 n\nfloat32 f\nuint8[] raw\nstring[] names\ntime at\nbool from\nbyte b\n"

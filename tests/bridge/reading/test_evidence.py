@@ -20,14 +20,14 @@ from bridge.reading.recorded import EVIL, KEYS, ROOTS, Recorded, at, odometry, r
 from bridge.reading.world import NAME, START, Pen, authority, message, reader, robot
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth.chunk import Chunk, Log, content_key, ledger_id, robot_id
-from rosbridge_eth.chunk import proofs as record_proofs
 from rosbridge_eth.cli import run
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol, read_certificates
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.ledger.contract import DataEvent
 from rosbridge_eth.ledger.nodes import Anvil, EmbeddedChain
+from rosbridge_eth.log.chunk import Chunk, Log, content_key, ledger_id, robot_id
+from rosbridge_eth.log.chunk import proofs as record_proofs
 from rosbridge_eth.reading import Choice
 from rosbridge_eth.reading import evidence as evidence_of
 from rosbridge_eth.reading.evidence import MAX_FILE, Asked, Evidence, Record, Statement, Written, ask, verify

@@ -11,13 +11,13 @@ import pytest
 from eth_hash.auto import keccak
 
 from bridge.reading.world import NAME, START, Pen, authority, reader, robot
-from rosbridge_eth.chunk import Log
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import DataEvent, Keyring, Ledger, Standing, contract
 from rosbridge_eth.ledger.contract import RegistrationEvent
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import TooMuch
+from rosbridge_eth.log.chunk import Log
 from rosbridge_eth.reading import Bookmarks, Kind, Reading, read_robot
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")

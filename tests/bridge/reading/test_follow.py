@@ -11,10 +11,10 @@ import pytest
 
 from bridge.reading.test_fetch import ACCOUNT, ETH, KEYS, NOW, OPERATOR, Chain, Node, chain
 from bridge.reading.world import NAME, Pen, authority, reader, robot
-from rosbridge_eth.chunk import Log, robot_id
 from rosbridge_eth.errors import ChainError, IdentityError
 from rosbridge_eth.identity import Trust
 from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.reading import Bookmark, Bookmarks, Choice, read_robot
 from rosbridge_eth.reading.follow import Followed, Following
 

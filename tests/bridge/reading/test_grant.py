@@ -13,9 +13,9 @@ import pytest
 from bridge.reading.test_fetch import Chain, chain, numbers
 from bridge.reading.world import NAME, START, authority, reader, robot
 from rosbridge_eth import identity
-from rosbridge_eth.chunk import NoGrant
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
+from rosbridge_eth.log.chunk import NoGrant
 from rosbridge_eth.reading import Choice, Reading, read_robot
 from rosbridge_eth.reading.grant import Keys, keys_of, make, open_folder, open_grant
 

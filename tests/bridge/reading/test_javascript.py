@@ -26,12 +26,12 @@ from bridge.reading.world import (
 )
 from conftest import unavailable
 from ports import free_port
-from rosbridge_eth import chunk
-from rosbridge_eth.chunk import Log, zstd
 from rosbridge_eth.errors import ChainError
 from rosbridge_eth.identity import CertificateAuthority, Trust
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import Anvil
+from rosbridge_eth.log import chunk
+from rosbridge_eth.log.chunk import Log, zstd
 from rosbridge_eth.reading import Verdict, read_robot
 from rosbridge_eth.reading.outputs import json_line
 

@@ -32,9 +32,9 @@ from bridge.reading.world import (
     standing,
 )
 from rosbridge_eth.capture.lines import parse_line
-from rosbridge_eth.chunk import Chunk, Log, check_proof, proofs, robot_id
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
+from rosbridge_eth.log.chunk import Chunk, Log, check_proof, proofs, robot_id
 from rosbridge_eth.reading.verdict import Findings, Kind
 from rosbridge_eth.reading.verify import NO_DIGEST, Verifier
 
@@ -433,7 +433,7 @@ def test_a_key_that_the_robot_wrapped_wrongly(monkeypatch):
 
 
 def test_a_root_that_is_not_the_records(monkeypatch):
-    from rosbridge_eth import chunk as chunks
+    from rosbridge_eth.log import chunk as chunks
 
     with monkeypatch.context() as lie:
         lie.setattr(chunks, "_leaf", lambda salt, line: b"\0" * 32)

@@ -12,9 +12,9 @@ from typing import Any
 from eth_hash.auto import keccak
 from pydantic import TypeAdapter
 
-from rosbridge_eth.chunk import Chunk, Log, drop, robot_id, seal
 from rosbridge_eth.identity import CertificateAuthority, Identity, Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
+from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id, seal
 from rosbridge_eth.reading.verdict import Bookmark, Finding, Kind, Links, Progress, Verdict
 from rosbridge_eth.reading.verify import NO_DIGEST, ProvenChunk, Verifier
 

@@ -7,8 +7,8 @@ import threading
 import pytest
 
 from rosbridge_eth.capture import RawMessage, Wire, decoder_for
-from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.live import OVERHEAD, Backlog, LiveSource
+from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.live import OVERHEAD, Backlog, LiveSource
 
 DECODER = decoder_for(Wire.CDR, "std_msgs/msg/String", "string data")
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import BagSource, Offer, Selection
+from rosbridge_eth.robot.sources import BagSource, Offer, Selection
 
 S = 10**9
 START = 1_700_000_000 * S

@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Reader
 
 from bridge.sources.values import value_at
 from rosbridge_eth.capture import Capture, TopicRule, parse_line
-from rosbridge_eth.sources import BagSource, Offer, Selection, sample_bag
+from rosbridge_eth.robot.sources import BagSource, Offer, Selection, sample_bag
 
 
 def records(topic: str):

@@ -9,7 +9,7 @@ import pytest
 
 from rosbridge_eth.config.models import SOURCE_KINDS, SimConfig
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import _KINDS, Offer, Selection, open_source
+from rosbridge_eth.robot.sources import _KINDS, Offer, Selection, open_source
 
 ODOM = Offer("/robot_1/odom", "nav_msgs/msg/Odometry", ("/robot_1/base",))
 IMU = Offer("/robot_1/imu", "sensor_msgs/msg/Imu", ("/robot_1/base", "/robot_1/imu_driver"))

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from bridge.sources.values import value_at
 from rosbridge_eth.capture import Capture, TopicRule, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import Selection, SimSource
-from rosbridge_eth.sources.sim import RADIUS, SPEED, Motion, advance, drive
+from rosbridge_eth.robot.sources import Selection, SimSource
+from rosbridge_eth.robot.sources.sim import RADIUS, SPEED, Motion, advance, drive
 
 S = 10**9
 

@@ -15,9 +15,9 @@ import pytest
 
 from bridge import disks
 from bridge.chunks import STREAM, chain, chunk, dropped
-from rosbridge_eth.chunk import Chunk, Log
-from rosbridge_eth.database import DiskFull
 from rosbridge_eth.errors import StoreError
+from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.database import DiskFull
 from rosbridge_eth.spool import Spool
 
 LOG = Log(b"l" * 32, b"r" * 32)
@@ -82,7 +82,7 @@ CHILD = f"""
 import sys
 from pathlib import Path
 from bridge.chunks import chain, dropped
-from rosbridge_eth.chunk import Log
+from rosbridge_eth.log.chunk import Log
 from rosbridge_eth.spool import Spool
 spool = Spool(Path(sys.argv[1]), Log({LOG.ledger!r}, {LOG.tk!r}), max_bytes=20_000, drop=dropped)
 for number, one in enumerate(chain(100_000, size=1000)):

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from bridge.chunks import STREAM, chain, chunk, dropped
-from rosbridge_eth.chunk import Chunk, Log
-from rosbridge_eth.database import InUse, NothingThere
 from rosbridge_eth.errors import StoreError
+from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.database import InUse, NothingThere
 from rosbridge_eth.spool import Spool
 
 LOG = Log(b"l" * 32, b"r" * 32)
@@ -260,8 +260,8 @@ def test_the_file_is_for_its_owner_alone(path, spool):
 def test_a_second_process_is_refused_and_may_not_even_look(path, spool):
     source = f"""
 from pathlib import Path
-from rosbridge_eth.chunk import Log
-from rosbridge_eth.database import InUse
+from rosbridge_eth.log.chunk import Log
+from rosbridge_eth.log.database import InUse
 from rosbridge_eth.spool import Spool
 for read_only in (False, True):
     try:

@@ -21,8 +21,8 @@ from typing import Any
 
 secrets.token_bytes = lambda size=None: b"\x5a" * (size or 32)  # type: ignore[assignment]
 
-from rosbridge_eth import chunk as chunks  # noqa: E402
-from rosbridge_eth.chunk import Chunk, Log  # noqa: E402
+from rosbridge_eth.log import chunk as chunks  # noqa: E402
+from rosbridge_eth.log.chunk import Chunk, Log  # noqa: E402
 from smcrypto import sm2, sm3, sm4  # noqa: E402
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from ports import free_port
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
-from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros1.source import Ros1Source
+from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.ros1.source import Ros1Source
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
 PUBLISHERS = Path(__file__).with_name("publishers.py")

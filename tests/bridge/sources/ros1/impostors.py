@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
-from rosbridge_eth.sources.ros1.tcpros import encode_header
+from rosbridge_eth.robot.sources.ros1.tcpros import encode_header
 
 Conversation = Callable[[socket.socket], None]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.ros1.addressing import (
+from rosbridge_eth.robot.sources.ros1.addressing import (
     ProtocolError,
     bind_host,
     is_graph_name,

@@ -25,9 +25,9 @@ from bridge.sources.ros1.impostors import (
     saying,
 )
 from rosbridge_eth.config import Address
-from rosbridge_eth.sources import Offer
-from rosbridge_eth.sources.ros1 import api
-from rosbridge_eth.sources.ros1.addressing import ProtocolError
+from rosbridge_eth.robot.sources import Offer
+from rosbridge_eth.robot.sources.ros1 import api
+from rosbridge_eth.robot.sources.ros1.addressing import ProtocolError
 
 
 def asked(conversation, timeout: float = 5.0):

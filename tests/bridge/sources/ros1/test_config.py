@@ -9,8 +9,8 @@ import pytest
 from rosbridge_eth.config import RobotConfig, parse_config
 from rosbridge_eth.config.models import Ros1Config
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.sources import open_source
-from rosbridge_eth.sources.ros1.source import Ros1Source
+from rosbridge_eth.robot.sources import open_source
+from rosbridge_eth.robot.sources.ros1.source import Ros1Source
 
 
 def source(text: str) -> Ros1Config:

@@ -30,8 +30,8 @@ from bridge.sources.ros1.impostors import (
     numbered,
     saying,
 )
-from rosbridge_eth.sources.ros1 import publisher
-from rosbridge_eth.sources.ros1.tcpros import encode_header
+from rosbridge_eth.robot.sources.ros1 import publisher
+from rosbridge_eth.robot.sources.ros1.tcpros import encode_header
 
 MIB = 2**20
 

@@ -11,8 +11,8 @@ import pytest
 from bridge.sources.ros1.graph import Graph, Listening, eventually
 from rosbridge_eth.capture import Capture, RawMessage, Restoration, TopicRule, definition_line, parse_line
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import BagSource, Offer, Selection, sample_bag
-from rosbridge_eth.sources.ros1.source import Ros1Source
+from rosbridge_eth.robot.sources import BagSource, Offer, Selection, sample_bag
+from rosbridge_eth.robot.sources.ros1.source import Ros1Source
 
 pytestmark = pytest.mark.service
 

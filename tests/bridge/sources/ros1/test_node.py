@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros1 import api, source
-from rosbridge_eth.sources.ros1.addressing import ProtocolError
-from rosbridge_eth.sources.ros1.publisher import FIRST_RETRY, LAST_RETRY, STEADY, Publisher
-from rosbridge_eth.sources.ros1.source import Ros1Source
-from rosbridge_eth.sources.ros1.tcpros import Publication
+from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.ros1 import api, source
+from rosbridge_eth.robot.sources.ros1.addressing import ProtocolError
+from rosbridge_eth.robot.sources.ros1.publisher import FIRST_RETRY, LAST_RETRY, STEADY, Publisher
+from rosbridge_eth.robot.sources.ros1.source import Ros1Source
+from rosbridge_eth.robot.sources.ros1.tcpros import Publication
 
 API = "http://me:1/"
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from bridge.sources.ros1.graph import SYSTEM_PYTHON
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources.ros1.api import Refusal
-from rosbridge_eth.sources.ros1.tcpros import decode_header, read_publication, request_header
+from rosbridge_eth.robot.sources.ros1.api import Refusal
+from rosbridge_eth.robot.sources.ros1.tcpros import decode_header, read_publication, request_header
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "message_definition": "string data"}
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosbridge_eth.sources.ros1.addressing import ProtocolError
-from rosbridge_eth.sources.ros1.tcpros import (
+from rosbridge_eth.robot.sources.ros1.addressing import ProtocolError
+from rosbridge_eth.robot.sources.ros1.tcpros import (
     IMPLAUSIBLE,
     MAX_FIELDS,
     MAX_HEADER,

@@ -9,7 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.sources.ros2.graph import Graph
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for, normalised_type_name, read_definition
-from rosbridge_eth.sources.ros2.rclpy_parts import definition_text
+from rosbridge_eth.robot.sources.ros2.rclpy_parts import definition_text
 
 pytestmark = pytest.mark.service
 PACKAGES = (
@@ -21,7 +21,7 @@ PACKAGES = (
 ALL = f"""
 import importlib, json, sys
 from pathlib import Path
-from rosbridge_eth.sources.ros2.rclpy_parts import definition_text
+from rosbridge_eth.robot.sources.ros2.rclpy_parts import definition_text
 found = {{}}
 for package in {PACKAGES!r}:
     module = importlib.import_module(package + ".msg")

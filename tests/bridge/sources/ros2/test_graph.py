@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.sources.ros2.graph import Graph
 from rosbridge_eth.capture import Capture, TopicRule, parse_line
-from rosbridge_eth.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
 pytestmark = pytest.mark.service
@@ -227,8 +227,8 @@ def test_a_node_stands_for_what_it_publishes(ros: Graph):
 
 RELOADED = """
 import logging, queue, threading
-from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros2 import source as ros2
+from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.ros2 import source as ros2
 
 told = queue.SimpleQueue()
 handler = logging.Handler(logging.WARNING)

@@ -15,8 +15,8 @@ from bridge.lone_robot import chunks_of, command, lines_of, lone_robot
 from bridge.sources.ros2.graph import Graph
 from bridge.terminal import Terminal
 from rosbridge_eth.config import load_robot_config
+from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ExitCode
-from rosbridge_eth.home import RobotHome
 
 pytestmark = pytest.mark.service
 

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from rosbridge_eth.errors import ExitCode, SourceError
-from rosbridge_eth.sources import Selection
-from rosbridge_eth.sources.ros2.source import Ros2Source
+from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.ros2.source import Ros2Source
 
 
 def test_without_rclpy_the_error_says_how_to_get_it(monkeypatch):

@@ -26,7 +26,7 @@ from rosbridge_eth.capture import (
 )
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.sources import open_source
+from rosbridge_eth.robot.sources import open_source
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(message)s")
 stop = threading.Event()

@@ -1,0 +1,1 @@
+"""The operator's side: home and registry, enrolment of robots and readers, and how everything stands."""

@@ -1,0 +1,460 @@
+"""`doctor`: tries everything that a home depends on, for real, and names the fix for what does not work.
+
+A check is one function that yields findings. It changes nothing: what is not there yet is not made, and a port or a
+session that is tried is given back.
+"""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import json as jsonlib
+import os
+import socket
+import sqlite3
+import stat
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
+
+import typer
+
+from rosbridge_eth import identity as ids
+from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.config.passphrases import passphrase_file, read_passphrase
+from rosbridge_eth.config.values import parse_address
+from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError
+from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.log.database import InUse, NothingThere
+from rosbridge_eth.operator.bundle import needs_password, read_bundle
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.operator.status import ANSWER_TIME, span
+from rosbridge_eth.robot import sources
+from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
+from rosbridge_eth.robot.sender import mend
+from rosbridge_eth.robot.topics import offered
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger import Ledger
+
+HANDSHAKE_TIME, ATTEMPT_TIME = 6.0, 2.5  # seconds for a server to answer; for an attempt, with which a refusal is known
+EXPIRY = timedelta(days=30)
+LITTLE_ROOM = 64 << 20  # bytes
+WRONG_CLOCK = 300.0  # seconds between two clocks of which one is wrong
+OLD_HEAD = 12 * 3600.0  # seconds since the last block
+
+
+class Finding(NamedTuple):
+    """One thing that was tried: what was found, and the fix where something is to be done.
+
+    result: "ok"; "note": it works, and will not for ever or not at its best; "broken"; "skipped": it could not be
+    tried, and `mend` says what it takes.
+    """
+
+    result: str
+    what: str
+    found: str
+    mend: str = ""
+
+
+Home: TypeAlias = OperatorHome | RobotHome | ReaderHome
+Findings: TypeAlias = Iterator[Finding]
+Check: TypeAlias = Callable[[Any, bytes | None], Findings]
+"""A check is given the home, as what it is, and, where there is one, the passphrase of its keys."""
+ok, note, broken, skipped = (partial(Finding, result) for result in ("ok", "note", "broken", "skipped"))
+
+
+def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Findings:
+    """Run the checks one after the other; a failure of the bridge's own is a finding, whose text has the fix. What
+    ends several checks is told once."""
+    told = set[str]()
+    for what, check in checks.items():
+        try:
+            yield from check(home, secret)
+        except (OSError, sqlite3.Error) as error:
+            name = getattr(error, "filename", None)
+            yield broken(what, f"{f'{name}: ' if name else ''}{getattr(error, 'strerror', None) or error}",
+                         "see that it is there, whole, and this user's to read")
+        except BridgeError as error:
+            if str(error) in told:
+                continue
+            told.add(str(error))
+            yield broken(what, str(error))
+
+
+# The machine
+
+
+def clock(home: Home, secret: bytes | None) -> Findings:
+    if not clock_synchronised():
+        yield note("clock", "the kernel does not hold it to be synchronised",
+                   "start systemd-timesyncd or chrony; records say that their time is not to be relied on")
+    else:
+        yield ok("clock", "synchronised")
+
+
+def files(home: Home, secret: bytes | None) -> Findings:
+    mode = stat.S_IMODE(home.path.stat().st_mode)
+    if mode & 0o077:
+        result, may = (broken, "write to") if mode & 0o022 else (note, "look into")
+        yield result("home", f"others may {may} {home.path} (mode {mode:04o})", f"chmod 700 {home.path}")
+    elif not os.access(home.path, os.W_OK):
+        yield broken("home", f"{home.path} is not writable for this user", "run as the user the service runs as")
+    else:
+        yield ok("home", f"{home.path}, its owner's alone")
+    for key in sorted([*home.path.rglob("*.key.pem"), *home.path.glob("accounts.json")]):
+        mode = stat.S_IMODE(key.stat().st_mode)
+        if mode & 0o077:
+            yield broken("key files", f"{key} is open to others (mode {mode:04o})",
+                         f"chmod 600 {key}, and if it may have been read, make its keys anew")
+
+
+def disk(home: Home, secret: bytes | None) -> Findings:
+    found = os.statvfs(home.path)
+    free = found.f_bavail * found.f_frsize
+    if free < LITTLE_ROOM or (found.f_files and not found.f_favail):
+        yield broken("disk", f"{free >> 20} MiB and {found.f_favail} files free at {home.path}",
+                     "make room: until there is some nothing more is taken; what was taken is safe")
+    else:
+        yield ok("disk", f"{free >> 20} MiB free")
+
+
+def certificates(folder: Path, renewal: str) -> Findings:
+    """Are the certificates in a folder in force, and for how long? renewal: how they are made anew."""
+    now = datetime.now(UTC)
+    for path in sorted(folder.glob("*.crt.pem")):
+        for each in ids.read_certificates(path.read_bytes()):
+            mend = "make a new home, with a new CA" if path.name == "ca.crt.pem" else renewal
+            if each.not_after < now:
+                yield broken("certificates", f"{path} expired on {each.not_after:%Y-%m-%d}", mend)
+            elif each.not_before > now:
+                yield broken("certificates", f"{path} begins on {each.not_before:%Y-%m-%d}", "set the clock")
+            elif each.not_after - now < EXPIRY:
+                yield note("certificates", f"{path} expires in {(each.not_after - now).days} days", mend)
+            else:
+                yield ok("certificates", f"{path.name} of {folder.name} until {each.not_after:%Y-%m-%d}")
+
+
+def near(address: Address) -> Address:
+    """Where a socket of this machine that listens there is reached from here."""
+    return address._replace(host={"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address.host, address.host))  # noqa: S104
+
+
+def monitor(address: Address | None, runs: bool) -> Findings:
+    """Is the port of /metrics free, or does the process that should have it answer there?"""
+    if address is None:
+        return
+    try:
+        if not runs:
+            socket.create_server(address, family=address.family).close()
+            yield ok("monitor", f"{address} is free")
+            return
+        with closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection:
+            connection.request("GET", "/readyz")
+            conditions = dict[str, bool](jsonlib.loads(connection.getresponse().read())["conditions"])
+        if not conditions:
+            raise ValueError("no conditions")
+    except (OSError, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
+        yield broken("monitor port", f"{address} is not answered by this home's process ({error})",
+                     "stop what has the port, or correct `monitor`; then start again")
+        return
+    if failing := [name for name, holds in conditions.items() if not holds]:
+        yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
+    else:
+        yield ok("monitor", f"{address} says ready")
+
+
+def shake_hands(
+    place: Address, identity: ids.Identity, trust: ids.Trust, server: str, mode: str, wall: Callable[[], datetime]
+) -> tuple[Connected | HandshakeFailed, int]:
+    """Try a session, and end it: how that went, and how many datagrams came back."""
+    sock, address = client_socket(place)
+    events, now = list[Event](), time.monotonic()
+    config = ClientConfig(mode=Mode[mode.upper()], attempt_timeout=ATTEMPT_TIME)
+    client = Client(config, identity, trust, server, now, wall=wall)
+    client.connect(address, now)
+    with closing(UdpLoop(client, sock, events.append)) as loop:
+        while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(each, Connected) for each in events):
+            loop.step(0.2)
+        client.close(time.monotonic())
+        loop.step(0.0)
+    ends = [event for event in events if isinstance(event, Connected | HandshakeFailed)]
+    # A session, else a refusal with its reason: one attempt may have lost what another was told.
+    best = min(ends, key=lambda end: (isinstance(end, HandshakeFailed), getattr(end, "hint", None) is None),
+               default=HandshakeFailed("no answer"))
+    return best, client.statistics()["datagrams_received"]
+
+
+def chain(ledger: Ledger) -> Findings:
+    """The node answers, has our contract, and its time is ours."""
+    head = ledger.block()
+    age = time.time() - head.time
+    yield ok("node", f"{ledger.url} answers; block {head.number}, {span(max(0.0, age))} old")
+    ledger.check()
+    yield ok("contract", f"{ledger.contract} on chain {ledger.chain_id} has the code of this version")
+    if age < -WRONG_CLOCK:
+        yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
+    elif age > OLD_HEAD:
+        yield broken("clock", f"by it, the last block is {span(age)} old",
+                     "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
+                     " makes the next one with the next transaction)")
+
+
+# An operator's home
+
+
+def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings:
+    config = load_server_config(home.config)
+    yield ok("configuration", str(home.config))
+    robots = str(config.address_for_robots())
+    for bundle in sorted(home.bundles.glob("*.bundle")):
+        content = bundle.read_bytes()
+        try:
+            told = robots if needs_password(content) else read_bundle(content).end.server_address
+        except IdentityError as error:
+            yield note("bundle", f"{bundle}: {error}",
+                       f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
+            continue
+        if told != robots:
+            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
+                       f'write server = "{robots}" into the robot.toml of who joined with it')
+
+
+def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Keyring
+
+    if secret is None:
+        yield skipped("passphrase", "none was given", "give --passphrase-file")
+        return
+    ids.load_identity(home.server, secret)
+    Keyring.load(home.accounts, secret)
+    yield ok("passphrase", "opens the server's keys and the accounts")
+
+
+def door(home: OperatorHome, secret: bytes | None) -> Findings:
+    """The robots' UDP port is free, or a server answers there; the same of the monitor's."""
+    config = load_server_config(home.config)
+    try:
+        for sock in server_sockets(config.listen):
+            sock.close()
+        runs = False
+        yield ok("UDP port", f"{config.listen} is free: the server does not run")
+    except NetworkError as error:
+        if not isinstance(error.__cause__, OSError) or error.__cause__.errno != errno.EADDRINUSE:
+            raise
+        now = datetime.now(UTC)
+        ca = ids.create_ca("doctor", at=now)  # who is not let in is refused, but by a server
+        nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
+        place = near(config.listen)
+        end, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
+        runs = isinstance(end, HandshakeFailed) and end.hint is not None
+        if runs:
+            yield ok("UDP port", f"a server answers at {place}")
+        else:
+            yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
+                         f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
+    yield from monitor(config.monitor, runs)
+
+
+def registry(home: OperatorHome, secret: bytes | None) -> Findings:
+    with Registry(home.registry) as opened:
+        yield ok("registry", f"{sum(name.revoked_at is None for name in opened.all())} names in force")
+
+
+def store(home: OperatorHome, secret: bytes | None) -> Findings:
+    from rosbridge_eth.server.supervisor import open_store
+
+    if not home.deployment_file.exists():
+        yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home.path}`")
+        return
+    try:
+        inbox = open_store(load_server_config(home.config), home, read_only=True)
+    except NothingThere:
+        yield ok("store", "there is none yet; the server makes it")
+        return
+    with closing(inbox):
+        inbox.check()
+        yield ok("store", f"{sum(waiting.chunks for waiting in inbox.totals().values())} chunks wait")
+
+
+def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Ledger
+    from rosbridge_eth.ledger.contract import WEI_PER_ETH
+
+    config = load_server_config(home.config)
+    with closing(Ledger.connect(config.chain.url, home.deployment())) as ledger, Registry(home.registry) as opened:
+        yield from chain(ledger)
+        if ledger.operator() != home.account:
+            yield broken("operator", f"the contract's operator is {ledger.operator()}, this home's {home.account}",
+                         "use the home of that account, or let it offer and this one accept the role")
+        treasury = ledger.balance(home.account) / WEI_PER_ETH
+        if treasury < config.funds.by:
+            yield broken("treasury", f"{home.account} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
+                         f"send ETH to {home.account}")
+        else:
+            yield ok("treasury", f"{treasury:.4f} ETH")
+        robots = {tk: robot for tk, robot in opened.robots().items() if robot.revoked_at is None}
+        for robot, standing in zip(robots.values(), ledger.standings([*robots]), strict=True):
+            if standing.certificates_hash != robot.hash or standing.revoked:
+                yield broken("registration", f"the contract has {robot.name} with other certificates, or revoked",
+                             f"run `register {robot.name} REQUEST --replace`, or restore a newer registry.sqlite")
+
+
+# A robot's home
+
+
+def bridge(home: RobotHome, secret: bytes | None) -> Findings:
+    end, config = home.bridge(), load_robot_config(home.config)
+    yield ok("configuration", str(home.config))
+    place = config.server or parse_address(end.server_address)
+    if place.nowhere:
+        yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
+                     'write server = "HOST:PORT", as the server is reached, into robot.toml')
+    else:
+        yield ok("bridge", f"{end.robot} sends to {end.server_name} at {place}")
+
+
+def robot_certificates(home: RobotHome, secret: bytes | None) -> Findings:
+    answer = f"`register {home.bridge().robot} REQUEST --replace` with {home.request.name}"
+    yield from certificates(home.identity, f"let the operator run {answer}, and join again")
+
+
+def readers(home: RobotHome, secret: bytes | None) -> Findings:
+    home.bridge()  # with which the CA's certificate came
+    roots = ids.read_certificates((home.identity / "ca.crt.pem").read_bytes())
+    yield ok("readers", f"{len(reader_keys(load_robot_config(home.config), home, roots))} can open what it writes")
+
+
+def source(home: RobotHome, secret: bytes | None) -> Findings:
+    config = load_robot_config(home.config)
+    settings, why = config.source_and_why(os.environ)
+    with closing(sources.open_source(settings, config.selection())) as opened:
+        offers = offered(opened)
+    if settings.kind == "sim":
+        yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
+    elif not offers:
+        yield note("source", f"{settings.kind} ({why}) answers and offers no topic", "start what publishes")
+    else:
+        yield ok("source", f"{settings.kind} ({why}) offers {len(offers)} topics")
+
+
+def session(home: RobotHome, secret: bytes | None) -> Findings:
+    """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
+    end, config, runs = home.bridge(), load_robot_config(home.config), False
+    log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
+    try:
+        Spool(home.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
+        yield ok("spool", "opens")
+    except NothingThere:
+        yield ok("spool", "none yet; the first start makes it")
+    except InUse:
+        runs = True
+        yield ok("spool", "in use by the robot that runs")
+    yield from monitor(config.monitor, runs)
+    if secret is None or runs:
+        why = "a session would end that of the robot that runs" if runs else "it takes the robot's keys to be let in"
+        way = "see `status` of this home" if runs else "give --passphrase-file"
+        yield skipped("server", f"{server} not tried: {why}", way)
+        return
+    identity, roots = ids.load_identity(home.identity, secret)
+    yield ok("password", f"opens the keys of {identity.name}")
+    trust, wall = ids.Trust(roots), certificate_clock(home)
+    found, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
+    if isinstance(found, HandshakeFailed):
+        yield broken("server", f"{server}: {found.why}", mend(found, config.channel) if answers else (
+            f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
+            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'))
+        return
+    yield ok("server", f"{server} made a session")
+    off = 0.0 if found.server_time is None else time.time() - found.server_time.timestamp()
+    if abs(off) > WRONG_CLOCK:
+        yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
+                     "set the one of the two that is wrong")
+
+
+# A reader's folder
+
+
+def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
+    yield from certificates(home.path, "let the operator make this reader anew (`reader NAME --replace`)")
+    if secret is None:
+        yield skipped("passphrase", "none was given", "give --passphrase-file")
+    else:
+        yield ok("passphrase", f"opens the keys of {ids.load_identity(home.path, secret)[0].name}")
+
+
+def reader_nodes(home: ReaderHome, secret: bytes | None) -> Findings:
+    from rosbridge_eth.ledger import Ledger
+
+    config = load_reader_config(home.config)
+    for url in config.chain:
+        with closing(Ledger.connect(url, config)) as ledger:
+            yield from examine({"node": lambda ledger, _: chain(ledger)}, ledger, secret)
+
+
+_MACHINE: dict[str, Check] = {"clock": clock, "home": files, "disk": disk}
+CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
+    HomeKind.OPERATOR: (OperatorHome, _MACHINE | {
+        "configuration": operator_configuration,
+        "certificates": lambda home, _: certificates(home.path / "ca", ""),
+        "server's certificates": lambda home, _: certificates(
+            home.server, f"run `renew --home {home.path}`, then start the server again"),
+        "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
+        "node": operator_node,
+    }),
+    HomeKind.ROBOT: (RobotHome, _MACHINE | {
+        "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
+        "server": session,
+    }),
+    HomeKind.READER: (ReaderHome, _MACHINE | {"keys": own_keys, "node": reader_nodes}),
+}  # fmt: skip
+
+
+# The command
+
+_SIGN = {"ok": "ok", "note": "NOTE", "broken": "BROKEN", "skipped": "not tried"}
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth doctor --home robot --passphrase-file password")(doctor)
+
+
+def doctor(
+    home: AnyHomeOption = OPERATOR_HOME,
+    passphrase: Annotated[Path | None, typer.Option(
+        "--passphrase-file", help="Of this home's keys (a robot's password), to try them.")] = None,
+    json: Json = False,
+) -> None:
+    """Check all that a home depends on, and name the fix. An operator's, a robot's, a reader's.
+
+    Exits with 1 if something is broken.
+    """
+    kind = kind_of(home)
+    file = passphrase or passphrase_file(kind)
+    if file is None and kind is HomeKind.OPERATOR:
+        with suppress(BridgeError):  # a configuration that cannot be read is a finding, and told below
+            file = load_server_config(OperatorHome(home).config).passphrase_file
+    secret = None if file is None else read_passphrase(kind, "", file=file)
+    findings, (of, checks) = list[Finding](), CHECKS[kind]
+    for finding in examine(checks, of(home), secret):
+        findings.append(finding)
+        if not json and finding.result != "ok":
+            told = "; ".join(filter(None, (finding.found, finding.mend)))
+            talk(f"{_SIGN[finding.result]}: {finding.what}: {told}")
+    count = sum(finding.result == "broken" for finding in findings)
+    if json:
+        print_json({"home": str(home), "kind": kind, "broken": count, "findings": [f._asdict() for f in findings]})
+    else:
+        rows = [(f.what, _SIGN[f.result], f.found) for f in findings]
+        data.print(table(f"The {kind}'s home {home}", ["what", "result", "found"], rows))
+    if count:
+        raise BridgeError(f"broken: {count}; each line above names the fix")

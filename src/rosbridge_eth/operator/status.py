@@ -1,0 +1,377 @@
+"""`status`: what is where, by a home: who is enrolled, connected, waiting or on hold, and what the chain has.
+
+It asks registry, inbox, node and the figures of the running server or robot; whatever of them is not there, the rest is
+shown, and a sentence says what is not known and why. Nothing is changed or made.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from rosbridge_eth.config import ServerConfig, load_robot_config, load_server_config
+from rosbridge_eth.config.home import HomeKind, OperatorHome, RobotHome, kind_of
+from rosbridge_eth.config.values import counted
+from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
+from rosbridge_eth.identity import Role
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id
+from rosbridge_eth.log.database import InUse, NothingThere
+from rosbridge_eth.operator.registry import Enrolment, Registry
+from rosbridge_eth.spool import Spool
+from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger import Ledger, Standing
+
+_WEI: Final = 10**18
+ANSWER_TIME = 5.0  # seconds for a node or a monitor
+SPENDING_BLOCKS = 100  # what an account spends is seen by its balance so many blocks ago: geth keeps 128 states
+SEEN = 15.0  # seconds since a worker last saw the session
+FOLLOW_EVERY = 2.0
+DEAD = 1000  # dead letters; the inbox keeps no more
+Report = dict[str, Any]
+TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
+FEW_DAYS = 7.0
+Figure = tuple[str, dict[str, str], float]
+_NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
+_SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
+_OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
+             "chain_block": "block", "on_hold": "hold", "waiting_chunks": "chunks", "waiting_seconds": "oldest"}
+"""The server's figures of a robot, and what they are called here."""
+
+
+@contextmanager
+def _asking(report: Report, what: str) -> Iterator[None]:
+    """What cannot be known becomes a sentence of the report."""
+    try:
+        yield
+    except NothingThere:
+        pass
+    except BridgeError as error:
+        report["unknown"].append(f"{what}: {error}")
+
+
+def _running(report: Report, home: Path, otherwise: str, expected: Collection[str] = ()) -> list[Figure]:
+    """What the running processes of this home show; in the report, the conditions that do not hold.
+
+    expected: the processes; of a server those that it has started. otherwise: said where none of them beats.
+    """
+    from rosbridge_eth.server import metrics
+    from rosbridge_eth.server.supervisor import MONITOR
+
+    report["process"], found, holds = None, list[Figure](), dict[str, bool]()
+    with suppress(ValueError):  # nothing runs
+        found = metrics.figures(home)
+        expected = expected or {of["process"] for name, of, _ in found if name == "starts"} - {MONITOR}
+        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
+    if not any(holds.get(f"{process} runs") for process in expected):  # or what a killed one left
+        report["unknown"].append(otherwise)
+        return []
+    report["process"] = [name for name, so in holds.items() if not so]
+    return found
+
+
+def _add_figures(report: Report, figures: Collection[Figure]) -> None:
+    """What the server shows of each robot."""
+    now = time.time()
+    for robot in report["robots"].values() if figures else ():
+        robot |= {"connected": False, "address": None}
+    for name, labels, value in sorted(figures, key=lambda figure: figure[2]):
+        if (robot := report["robots"].get(labels.get("robot"))) is None:
+            continue
+        if name == "session_seen_seconds" and now - value < SEEN:
+            robot |= {"connected": True, "address": labels["address"]}
+        elif name in _OF_ROBOT:
+            of = robot.setdefault("waiting", {}) if name.startswith("waiting_") else robot
+            of[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
+
+
+def _operator(place: OperatorHome, name: str | None = None) -> Report:
+    """name: of the only robot that is looked at, and how far its log is on the chain."""
+    from rosbridge_eth.ledger import Ledger
+
+    config = load_server_config(place.config)
+    with Registry(place.registry) as registry:
+        enrolled, robots = registry.all(), registry.robots()
+    if name is not None:
+        if (tk := robot_id(name)) not in robots:
+            raise IdentityError(f"no robot {name!r} is enrolled; `status` lists the names")
+        robots = {tk: robots[tk]}
+    report: Report = {
+        "names": [
+            {"role": each.role, "name": each.name, "enrolled": each.enrolled_at,
+             "revoked": each.revoked_at, "account": each.account}
+            for each in enrolled
+        ],
+        "robots": {each.name: {"account": each.account, "in_force": each.revoked_at is None}
+                   for each in robots.values()},
+        "operator": {"account": place.account, "eth": None, "days_left": None}, "contract": None, "node": None,
+        "gas_per_day": config.funds.gas_per_day, "dead": [], "unknown": [],
+    }  # fmt: skip
+    _add_figures(report, _running(report, place.path, _NO_SERVER))
+    with _asking(report, "the contract"):
+        deployment = place.deployment()
+        report |= {"contract": deployment.contract, "chain": deployment.chain_id}
+        with _asking(report, "what waits"):
+            _add_inbox(report, place, config, robots)
+        with _asking(report, "the chain"), closing(
+            Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
+        ) as ledger:
+            head = ledger.block()
+            age = max(0.0, time.time() - head.time)
+            report["node"] = {"url": ledger.url, "block": head.number, "age_seconds": age}
+            try:
+                ledger.check()
+            except ChainError as error:
+                report["wrong_chain"] = str(error)
+                raise
+            _add_standings(report, ledger, robots, round(config.funds.by * _WEI))
+            if name is not None:
+                report["robots"][name]["log"] = _log(ledger, tk, head.number - config.chain.confirmations + 1)
+    report["alarms"] = [*_alarms(report)]
+    return report
+
+
+def fleet(place: OperatorHome) -> RenderableType:
+    """The picture of a running server at its terminal, from its own figures alone."""
+    report: Report = {"robots": {}, "unknown": [], "dead": []}
+    try:
+        with Registry(place.registry) as registry:
+            report["robots"] = {robot.name: {"in_force": True} for robot in registry.robots().values()
+                                if robot.revoked_at is None}  # fmt: skip
+    except BridgeError as error:  # of a file that is changed at this moment
+        return plain(str(error))
+    _add_figures(report, _running(report, place.path, _NO_SERVER))
+    return Group(_robots(report, money=False), *map(Text, _alarms(report)))
+
+
+def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots: Mapping[bytes, Enrolment]) -> None:
+    from rosbridge_eth.server.supervisor import open_store
+
+    names = {tk: robot.name for tk, robot in robots.items()}
+    with closing(open_store(config, place, read_only=True)) as inbox:
+        for tk, waiting in inbox.totals().items():
+            robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
+            oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
+            hold = inbox.state(tk).hold if waiting.chunks or robot["in_force"] else None
+            robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
+        reasons = Counter((letter.tk, letter.why) for letter in inbox.dead(DEAD))
+    report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
+                      for (tk, why), count in reasons.items()]  # fmt: skip
+
+
+def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment], top_up: int) -> None:
+    """What the chain has of each robot, and how long its account and the operator's last at what robots spent lately.
+
+    top_up: wei that an account is given at once. One that has more than before was given that.
+    """
+    head, seconds, total, operator = report["node"]["block"], 0, 0, report["operator"]
+    before: dict[bytes, Standing] = {}
+    treasury = ledger.balance(operator["account"])
+    operator["eth"] = treasury / _WEI
+    block = max(1, head - SPENDING_BLOCKS)
+    with _asking(report, f"how long accounts last, by their balances in block {block}"):
+        before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
+        seconds = ledger.block_time(head) - ledger.block_time(block)
+    for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
+        known = before.get(tk)
+        less = known.balance - now.balance if known is not None and known.account == now.account else 0
+        spent = less if less >= 0 else less % top_up
+        total += spent
+        report["robots"][robot.name] |= {
+            "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,
+            "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
+        }  # fmt: skip
+    operator["days_left"] = _days(treasury, total, seconds)
+
+
+def _log(ledger: Ledger, tk: bytes, confirmed: int) -> dict[str, Report | None]:
+    """The last chunk of the robot's log that the chain has, and the last one up to the block `confirmed`."""
+    [standing] = ledger.standings([tk])
+    log: dict[str, Report | None] = {"written": None, "confirmed": None}
+    for event in ledger.newest_data(tk, standing.data_block):
+        header = Chunk.parse(event.chunks[-1]).header
+        place = {"stream": header.stream.hex(), "number": header.number, "block": event.block,
+                 "transaction": "0x" + event.transaction.hex()}  # fmt: skip
+        log["written"] = log["written"] or place
+        if event.block <= confirmed:
+            return log | {"confirmed": place}
+    return log
+
+
+def _days(balance: float, spent: int, seconds: int) -> float | None:
+    return balance / spent * seconds / 86_400 if spent > 0 and seconds > 0 else None
+
+
+def _alarms(report: Report) -> Iterator[str]:
+    """What somebody has to see to."""
+    for condition in report["process"] or ():
+        yield f"ALARM: the server is not ready: {condition}: no"
+    for name, robot in report["robots"].items():
+        if hold := robot.get("hold"):
+            yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
+        if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
+            yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
+    for each in report["dead"]:
+        yield f"ALARM: dead letters, {counted(each['chunks'], 'chunk')} of {each['robot']}: {each['why']}"
+    days = report.get("operator", {}).get("days_left")
+    if days is not None and days < FEW_DAYS:
+        yield f"ALARM: the operator's account, from which robots are paid, lasts {days:.1f} days"
+
+
+def _robot(place: RobotHome) -> Report:
+    end, config = place.bridge(), load_robot_config(place.config)
+    report: Report = {
+        "robot": end.robot, "server": f"{end.server_name} at {config.server or end.server_address}",
+        "topics": [topic.topic for topic in config.topics], "nodes": list(config.nodes),
+        "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "unknown": [],
+    }  # fmt: skip
+    with _asking(report, "the spool"):
+        log = Log(end.ledger, robot_id(end.robot))
+        try:
+            with closing(Spool(place.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True)) as spool:
+                report["spool"] = spool.statistics()._asdict()
+        except InUse:
+            report["runs"] = True
+            wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
+                      "trigger_records")  # fmt: skip
+            report["figures"] = {
+                " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
+                for name, labels, value in _running(report, place.path, _SILENT, ["robot"]) if name in wanted
+            }  # fmt: skip
+    return report
+
+
+# What is shown
+
+
+def span(seconds: float | None) -> str:
+    """A length of time in its largest fitting unit."""
+    for unit, name in (86_400, "d"), (3600, "h"), (60, "m"):
+        if seconds is not None and seconds >= 2 * unit:
+            return f"{round(seconds / unit)}{name}"
+    return "" if seconds is None else f"{round(seconds)}s"
+
+
+def _process(report: Report) -> list[tuple[str, object]]:
+    failing = report["process"]
+    return [] if failing is None else [("process", "NOT READY: " + ", ".join(failing) if failing else "ready")]
+
+
+def _robots(report: Report, *, money: bool = True) -> RenderableType:
+    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas"], []
+    for name, robot in report["robots"].items():
+        waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
+        oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
+        rows.append((
+            name, (session or robot["address"]) if robot["in_force"] else "revoked", span(robot.get("newest")),
+            _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
+            _figure(robot, "chunks", ".0f"), _figure(robot, "block", ".0f"),
+            f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?",
+            *([_figure(robot, "eth", ".4f"), _figure(robot, "days_left", ".1f")] if money else []),
+        ))  # fmt: skip
+    title = "Robots: chunks that wait (how long) and that are on the chain, up to a block"
+    return table(title, [*columns, *(["ETH", "days"] if money else [])], rows, right=range(2, 10))
+
+
+def _figure(of: Mapping[str, Any], key: str, form: str) -> str:
+    """A number, a question mark where it is not known, nothing where there is none."""
+    return "?" if key not in of else "" if of[key] is None else format(of[key], form)
+
+
+def _show_operator(report: Report) -> Iterator[RenderableType]:
+    yield _robots(report)
+    eth, days, contract = report["operator"]["eth"], report["operator"]["days_left"], report["contract"]
+    node = report["node"]
+    head = f"{node['block']}, {span(node['age_seconds'])} old, at {node['url']}" if node else "not known"
+    others = [f"{each['role']} {each['name']}" for each in report["names"]
+              if each["role"] != Role.ROBOT and each["revoked"] is None]  # fmt: skip
+    treasury = "not known" if eth is None else f"{eth:.4f} ETH" + (f", for {days:.1f} days" if days is not None else "")
+    yield table("Server", ["what", "value"], [
+        ("contract", f"{contract} on chain {report['chain']}" if contract else "none yet; run `deploy`"),
+        ("last block", head), ("treasury", treasury),
+        ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
+        *_process(report),
+    ])  # fmt: skip
+    for name, robot in report["robots"].items():
+        for state, place in robot.get("log", {}).items():
+            yield f"{name}: {state} " + ("is nothing" if place is None else (
+                f"up to chunk {place['number']} of stream {place['stream']}, in block {place['block']},"
+                f" transaction {place['transaction']}"
+            ))  # fmt: skip
+    yield from report["alarms"]
+    for name, each in {"operator": report["operator"], **report["robots"]}.items():
+        if each["account"]:
+            yield f"{each['account']}  {name}"  # whole lines, to be copied
+
+
+def _show_robot(report: Report) -> Iterator[RenderableType]:
+    kept = "in use by the robot" if report["runs"] else "nothing yet"
+    if spool := report["spool"]:
+        chunks = counted(spool["chunks"], "chunk")
+        kept = f"{chunks}, {spool['bytes'] >> 10} KiB; the server lacks {spool['unstored']} of them"
+        kept += f" and refused {spool['aside']}" if spool["aside"] else ""
+    yield table(f"Robot {report['robot']}", ["what", "value"], [
+        ("server", report["server"]), ("topics, nodes", ", ".join([*report["topics"], *report["nodes"]])),
+        ("contract", f"{report['contract']} on chain {report['chain']}"), ("runs", "yes" if report["runs"] else "no"),
+        ("spool", kept), *_process(report),
+        *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
+    ])  # fmt: skip
+
+
+def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
+    """The report on a home, or on one robot of it, and how it is shown."""
+    kind = kind_of(path)
+    match kind:
+        case HomeKind.OPERATOR:
+            shown = _show_operator(report := _operator(OperatorHome(path), robot))
+        case HomeKind.ROBOT:
+            if robot is not None:
+                raise ConfigError(f"{path} is the home of one robot; leave its name out")
+            shown = _show_robot(report := _robot(RobotHome(path)))
+        case HomeKind.READER:
+            raise ConfigError(f"a reader's home has nothing that goes on; try it with `doctor --home {path}`")
+    return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command(epilog="Example: rosbridge-eth status robot_1; rosbridge-eth status --home robot")(status)
+
+
+def status(
+    robot: Annotated[str | None, typer.Argument(help="This one alone, and how far its log is on the chain.")] = None,
+    home: AnyHomeOption = OPERATOR_HOME,
+    follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
+    json: Json = False,
+) -> None:
+    """Show what is where: robots, what waits, balances, alarms. Of an operator's home, or a robot's.
+
+    What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
+    another chain than the contract.
+    """
+    from rich.live import Live
+
+    report, shown = _look(home, robot)
+    if follow and not json:
+        with Live(console=data, auto_refresh=False) as live:
+            while True:
+                live.update(Group(*shown, *map(Text, report["unknown"])), refresh=True)
+                time.sleep(FOLLOW_EVERY)
+                report, shown = _look(home, robot)
+    if json:
+        print_json(report)
+    else:
+        for each in shown:
+            data.print(each, soft_wrap=isinstance(each, Text))
+        for line in report["unknown"]:
+            talk(line)
+    if "wrong_chain" in report:
+        raise ChainError(report["wrong_chain"])

@@ -1,0 +1,1 @@
+"""The robot's side: from its topics to the server."""

@@ -1,0 +1,450 @@
+"""The robot's end: captures, writes chunks into the spool, and brings to the server what it does not have.
+
+    source's thread -> ring -> Robot's loop: capture -> writer -> spool -> Sender -> channel
+
+The source's thread only puts raw messages into a bounded ring; everything that has state belongs to the loop.
+Where the ring is full a bag waits, and a live source drops and counts, which becomes `lost` lines of the log.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import sys
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from typing import TypeVar
+
+from rosbridge_eth.capture import Capture, RawMessage, Record, TopicRule, stream_line
+from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
+from rosbridge_eth.channel.udp import ClientLoop
+from rosbridge_eth.config import RobotConfig, load_robot_config, reread
+from rosbridge_eth.config.home import RobotHome
+from rosbridge_eth.config.values import Address, counted, parse_address, time_text
+from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
+from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
+from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.logs import Trouble
+from rosbridge_eth.robot.blackbox import BlackBox
+from rosbridge_eth.robot.sender import Sender
+from rosbridge_eth.robot.sources import BagSource, Source, open_source
+from rosbridge_eth.spool import Spool
+from smcrypto import __version__, sm2, x509
+
+log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread and the loop, and their bytes
+TAKE = 128  # raw messages captured before the network gets its turn again
+LONGEST_WAIT = 0.25
+LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
+CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
+SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
+SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
+MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
+MARKS = 512  # places of the log for which it is known how many records of each topic they end
+LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
+
+_TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
+_TIMEX_SIZE = 512  # struct timex has 208 bytes on 64-bit Linux; modes = 0 in its first word asks and changes nothing
+
+
+def clock_synchronised() -> bool:
+    """Whether the kernel counts its clock as synchronised (NTP, PTP, chrony); False where it cannot be asked."""
+    adjtimex = getattr(ctypes.CDLL(None), "adjtimex", None) if sys.platform.startswith("linux") else None
+    return adjtimex is not None and 0 <= int(adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))) < _TIME_ERROR
+
+
+class Robot:
+    """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
+
+    def __init__(
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, server: Address,
+        sender: Sender, box: BlackBox | None = None,
+    ) -> None:  # fmt: skip
+        self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
+        self.client, self.sender, self.loop = client, sender, ClientLoop(client, server, self.handle)
+        sender.begin_stream = self.begin_stream
+        self.source, self.chunks = source, 0
+        self.written = Counter[str]()
+        """Records given to the writer, by topic."""
+        self.dropped_before = spool.statistics().dropped_bodies
+        """Of the bodies that the full spool gave up, those before this start."""
+        self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
+        self._confirmed = Counter[str]()
+        self._ring: deque[RawMessage] = deque()
+        self._put = self._taken = 0  # bytes that ever went into the ring, counted by its thread, and out of it
+        self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
+        self._source_error: BaseException | None = None
+        self._unspooled: deque[Chunk] = deque()
+        self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
+        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = float("-inf")
+        self._synchronised = self._finished = False
+        self.summary = ""
+        """What became of everything, in one line, after `run`."""
+        self.spool_trouble = Trouble(log, "the spool")
+
+    def stop(self) -> None:
+        """Let `run` come to an end, from any thread or a signal handler; what is not stored stays in the spool."""
+        self._stop.set()
+        self.loop.wake()
+
+    def take_up(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
+        """Go on by other topics, nodes and [capture], and seal for these readers; to be called in the loop's thread."""
+        self._add_losses(time.monotonic())
+        self.box.take_up(config.triggers())
+        self.capture.take_up(config.rules())
+        self.source.watch(config.selection())
+        self.writer.take_up(readers)
+
+    def fire(self, why: str, name: str | None = None) -> None:
+        """An event of this trigger, or of all, by hand; to be called in the loop's thread."""
+        replayed = 0 if self.source.live else self.box.newest_ns
+        self.box.fire(replayed or time.time_ns(), why, name)
+        if self._finished and self.box.released:  # the source has ended, and with it the stream
+            self._finished = False
+            self.writer.new_stream()
+
+    @property
+    def lost(self) -> dict[tuple[str, str], int]:
+        """Messages that are not in the log, by topic and why: lost by the source, refused, no memory to keep them."""
+        return {**self.source.lost, **self.capture.lost, **self.box.lost}
+
+    @property
+    def captured(self) -> int:
+        """Records given to the writer; what is kept in memory for an event is not among them."""
+        return self.written.total()
+
+    def confirmed(self) -> Counter[str]:
+        """Records confirmed on the chain since the start, by topic: those up to the newest place that is confirmed.
+
+        A chunk holds records of all topics, so what is kept are places of the log and not records. Of more than MARKS
+        places that wait every second is left out: then it is less, by less than what one of them stands for.
+        """
+        newest = self.sender.statistics.newest
+        done = [index for index, (stream, number, _) in enumerate(self._marks)
+                if newest is not None and stream == newest.stream and number <= newest.number]  # fmt: skip
+        for _ in range(done[-1] + 1 if done else 0):
+            self._confirmed = self._marks.popleft()[2]
+        return self._confirmed
+
+    def begin_stream(self, refused: bytes) -> None:
+        """The server refused a stream: if it is the one being written, go on in a new one."""
+        if refused == self.writer.stream:
+            self.writer.new_stream()
+
+    def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
+        """Until `stop`, or until the source has ended and the server has everything.
+
+        on_turn: called at every turn of the loop, to show progress. Raises what the source raised: of a live one at
+        once, so that it can be started again, of another after everything that was captured is delivered.
+        """
+        reading = threading.Thread(target=self._read, name="source", daemon=True)
+        reading.start()
+        try:
+            while not self._stop.is_set():
+                now = time.monotonic()
+                self._take(now)
+                if not self._finished and self._source_ended.is_set() and not self._ring and not self.box.released:
+                    self._finish(now)
+                else:
+                    self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
+                self.loop.seek(now)
+                if now >= self._send_at:
+                    self._spool_or(None, "send", self.sender.send)
+                on_turn()
+                if self._finished and not self._unspooled and self._spool_or(False, "idle", lambda: self.sender.idle):
+                    break
+                self.loop.step(self._wait(now))
+            else:
+                while (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
+                    self._take(now := time.monotonic())
+                    self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
+                if not self._finished:
+                    self._finish(time.monotonic())
+                self._spool_at = float("-inf")  # the last chunks do not wait
+                self._spool_chunks([], time.monotonic())
+                self._last_words()
+        finally:
+            self._stop.set()
+            self._room.set()
+            try:
+                self.client.close(time.monotonic())  # so that the server need not wait for a silent robot
+                self.loop.step(0.0)
+            finally:
+                self.source.close()
+                reading.join(timeout=5)
+                self.summary = self._spool_or("the spool cannot be read", "sum", self._summarise)
+                self.spool.close()
+                self.loop.close()
+        if self._source_error is not None:
+            raise self._source_error
+
+    # The source's thread
+
+    def _read(self) -> None:
+        try:
+            self.source.run(self._emit, self._stop)
+        except BaseException as error:  # kept and raised in the thread that waits for this one
+            self._source_error = error
+            log.error("the source has ended", exc_info=error)
+            if self.source.live:
+                self._stop.set()
+        finally:
+            self._source_ended.set()
+            self.loop.wake()
+
+    def _emit(self, raw: RawMessage) -> None:
+        while self._full() and not self._stop.is_set():
+            self._room.clear()
+            if self._full():
+                self._room.wait(0.2)
+        self._put += len(raw.raw)
+        self._ring.append(raw)
+        if len(self._ring) == 1:
+            self.loop.wake()
+
+    def _full(self, share: int = 1) -> bool:
+        return len(self._ring) >= RING // share or self._put - self._taken >= RING_BYTES // share
+
+    # The loop's thread
+
+    def _take(self, now: float) -> None:
+        if now - self._synchronised_at > SYNCHRONISED_EVERY:
+            self._synchronised, self._synchronised_at = clock_synchronised(), now
+        for _ in range(TAKE):
+            if len(self._unspooled) >= MAX_UNSPOOLED or self.writer.next_timer() <= now:
+                break
+            if self.box.released:  # before anything new, so that no more is kept than was stated
+                self._write(self.box.released.popleft(), now)
+            elif self._ring:
+                self._capture(self._ring.popleft(), now)
+            else:
+                break
+        if not self._full(2):
+            self._room.set()
+        if now - self._losses_at >= LOSSES_EVERY and len(self._unspooled) < MAX_UNSPOOLED:
+            self._losses_at = now
+            self._add_losses(now)
+
+    def _capture(self, raw: RawMessage, now: float) -> None:
+        self._taken += len(raw.raw)
+        self.box.look(raw)
+        record = self.capture.process(raw, time.time_ns(), self._synchronised)
+        if record is not None and record.trigger is not None:
+            self.box.keep(record.trigger, record)
+        elif record is not None:
+            self._write(record, now)
+
+    def _write(self, record: Record, now: float) -> None:
+        self.writer.add(record.line, now, record.definition, topic=record.topic)
+        if record.definition is not None:  # else it is no message
+            self.written[record.topic] += 1
+
+    def _add_losses(self, now: float) -> None:
+        for line in self.capture.loss_lines({**self.source.lost, **self.box.lost}):
+            self.writer.add(line, now)
+
+    def _finish(self, now: float) -> None:
+        self._finished = True
+        self._add_losses(now)
+        self._spool_chunks(self.writer.finish(time.time_ns() // 10**6), now)
+
+    def _spool_chunks(self, chunks: list[Chunk], now: float) -> None:
+        """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the ring."""
+        self._unspooled.extend(chunks)
+        self.chunks += len(chunks)
+        if chunks:
+            last = chunks[-1].header
+            self._marks.append((last.stream, last.number, self.writer.sealed.copy()))
+            if len(self._marks) > MARKS:
+                self._marks = deque([*self._marks][::-2][::-1])
+        if "append" not in self._failing or now - self._spool_at >= SPOOL_AGAIN:
+            self._spool_at = now
+            self._spool_or(None, "append", self._append)
+
+    def _append(self) -> None:
+        while self._unspooled:
+            self.spool.append(self._unspooled[0])
+            self._unspooled.popleft()
+
+    def _wait(self, now: float) -> float:
+        if (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
+            return 0.0
+        due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
+        return max(0.0, min(LONGEST_WAIT, due))
+
+    def _last_words(self) -> None:
+        """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
+        deadline = time.monotonic() + LAST_WORDS_TIME
+        while self.sender.statistics.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
+            if (now := time.monotonic()) >= deadline:
+                break
+            self._spool_chunks([], now)
+            self._spool_or(None, "send", self.sender.send)
+            self.loop.step(0.02)
+
+    def handle(self, event: Event) -> None:
+        """Take one event of the client. What the spool cannot note is asked for again, a second later."""
+        now = time.monotonic()
+        self._spool_or(None, "note", partial(self.sender.handle, event, now))
+        self._send_at = now + SPOOL_AGAIN if "note" in self._failing else now
+
+    def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
+        """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
+
+        A spool may do one thing and not another: it is well again when all that it did not do is done.
+        """
+        try:
+            given = call()
+        except StoreError as error:
+            self._failing[what], given = str(error), otherwise
+        else:
+            self._failing.pop(what, None)
+        self.spool_trouble.now(next(iter(self._failing.values()), None))
+        return given
+
+    def _summarise(self) -> str:
+        spool, sender = self.spool.statistics(), self.sender.statistics
+        lost = {
+            "messages lost before they could be captured": sum(self.source.lost.values()),
+            "messages left out as too large or undecodable": sum(self.capture.lost.values()),
+            "records that there was no memory for until their event": self.box.lost.total(),
+            "messages lost, since the spool took nothing":
+                len(self._ring) + len(self.box.released) if self._unspooled else 0,
+            "chunks lost, since the spool took nothing": len(self._unspooled),
+            f"chunks dropped, since the {'disk was full' if self.spool.disk_was_full else 'spool was at its max_size'}":
+                spool.dropped_bodies - self.dropped_before,
+            "chunks refused by the server": sender.refused,
+        }
+        parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]
+        parts += [f"{count} {what}" for what, count in lost.items() if count]
+        if not spool.unstored:
+            return ", ".join([*parts, "nothing waits for the server."])
+        line = ", ".join([*parts, f"{counted(spool.unstored, 'chunk')} not yet at the server"])
+        if sender.refusal is not None:
+            return f"{line}: {sender.refusal}."
+        if not sender.sessions:
+            return f"{line}: there was no session yet when it was stopped."
+        return f"{line}: it was stopped before the server had them; the next start sends them."
+
+
+# Putting a robot together
+
+
+def certificate_clock(home: RobotHome) -> Callable[[], datetime]:
+    """The clock to check certificates against: many robots start in 1970 for want of a battery, so it is never before
+    the latest time that a server has proven to this robot."""
+    return lambda: datetime.fromtimestamp(max(time.time(), home.clock_floor()), UTC)
+
+
+def keep_time(home: RobotHome, seconds: float) -> None:
+    """Keep the time that a server proved, for this clock; on a full disk the next server's will do.
+
+    A clock that is far from the server's is told: every record bears this machine's time.
+    """
+    away = time.time() - seconds
+    if abs(away) > CLOCKS_APART:
+        log.warning(
+            "this machine's clock is %s %s the server's, and every record bears its time: set it (NTP, chrony)",
+            timedelta(seconds=round(abs(away))), "ahead of" if away > 0 else "behind",
+        )  # fmt: skip
+    try:
+        home.raise_clock_floor(seconds)
+    except OSError as error:
+        log.warning("the server's time cannot be kept for the next start: %s", error.strerror)
+
+
+def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
+    """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first.
+
+    One whose certificates have ended is left out, and named in the log; ConfigError where nobody is left.
+    """
+    trust, keys, now = Trust(roots), [], certificate_clock(home)()
+    for path in config.reader_files(home.readers):
+        found = read_certificates(path.read_bytes())
+        if len(found) != 2:
+            raise ConfigError(f"{path} holds {len(found)} certificates; a reader has two, signing and encryption")
+        signing, encryption = found
+        born = max(signing.not_before, encryption.not_before)
+        peer = trust.check(signing.to_der(), encryption.to_der(), role=Role.READER, at=born)
+        if now > peer.not_after:
+            log.warning("not sealed for %s: its certificate ended at %s", peer, peer.not_after)
+        else:
+            keys.append(peer.encryption_certificate.public_key)
+    if not keys:
+        raise ConfigError("the certificates of all readers have ended, so nobody may open the records: join again")
+    return keys
+
+
+def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
+    """The robot of this home, ready to `run`. Raises ConfigError, IdentityError, SourceError, StoreError."""
+    end = home.bridge()
+    identity, roots = load_identity(home.identity, password)
+    readers = reader_keys(config, home, roots)
+    settings, _ = config.source_and_why(os.environ)
+    source = open_source(settings, config.selection())
+    capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
+    box = BlackBox(config.triggers())
+    for topic, decoders in source.decoders().items():
+        for decoder in decoders:
+            capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message
+            box.check(topic, decoder)
+    if isinstance(source, BagSource):
+        _say_what_is_outside(config.rules(), source.span)
+    place = Log(end.ledger, robot_id(identity.name))
+    key = identity.signing_key
+    spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
+    now = time.monotonic()
+    first_line = stream_line(source.kind, f"rosbridge_eth {__version__}")
+    writer = LogWriter(
+        place, key, readers, previous=spool.last_digest, stream_line=first_line,
+        period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress, now=now,
+    )
+    client = Client(
+        ClientConfig(mode=Mode[config.channel.upper()]), identity, Trust(roots), end.server_name, now,
+        wall=certificate_clock(home),
+    )
+    sender = Sender(client, spool, channel=config.channel, on_server_time=partial(keep_time, home))
+    return Robot(
+        source=source, capture=capture, writer=writer, spool=spool, client=client,
+        server=config.server or parse_address(end.server_address), sender=sender, box=box,
+    )
+
+
+def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConfig:
+    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, triggers,
+    [capture] and readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from
+    now on.
+
+    What cannot be used is told, and nothing changes.
+    """
+    keys = [*(("topics", "nodes", "trigger") if robot.source.live else ()), "capture", "readers"]
+    try:
+        config, said = reread(running, load_robot_config(home.config), keys)
+        roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
+        robot.take_up(config, reader_keys(config, home, roots))
+    except (BridgeError, OSError) as error:
+        log.error("nothing is taken up: %s", error)
+        return running
+    log.warning("%s", said)
+    return config
+
+
+def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> None:
+    """A rule that nothing in a recording can meet captures nothing, and would do so without a word."""
+    first, last = span
+    if first > last:
+        return  # the source has said that it replays nothing
+    for rule in rules:
+        if max(rule.at_ns or 0, rule.from_ns or 0) > last or (rule.until_ns is not None and rule.until_ns <= first):
+            log.warning(
+                "%s: `at`, `from` or `until` leaves nothing to capture: what is replayed of the recording goes from"
+                " %s to %s", rule.topic, time_text(first), time_text(last),
+            )
