@@ -54,7 +54,7 @@ from rosbridge_eth.log.chunk import Chunk, Header, robot_id
 from rosbridge_eth.reading import Kind, ProvenRecord, Verdict, read_robot
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
-from rosbridge_eth.server.supervisor import open_store
+from rosbridge_eth.server.shard import open_store
 
 TOPIC = "/robot_1/odom"
 MESSAGES, PACE = 100, 5  # times as fast as recorded

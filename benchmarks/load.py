@@ -54,7 +54,7 @@ from ports import free_port
 from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Drop
 from rosbridge_eth.channel.protection import Direction
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome
 from rosbridge_eth.errors import StoreError
@@ -81,7 +81,7 @@ from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
 from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
-from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
+from rosbridge_eth.server.shard import open_reception, open_store, open_submitter
 from rosbridge_eth.spool import Spool
 from smcrypto import sm2
 

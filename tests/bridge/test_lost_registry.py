@@ -12,7 +12,7 @@ import pytest
 
 from bridge.home.world import PASSPHRASE, World
 from bridge.machine import PATIENCE, Machine, Running
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ExitCode, StoreError
@@ -22,7 +22,7 @@ from rosbridge_eth.operator.enrolment import load_server_identity
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.server import supervisor
 from rosbridge_eth.server.reception import Worker
-from rosbridge_eth.server.supervisor import Secrets, Supervisor, open_reception, open_submitter
+from rosbridge_eth.server.shard import Secrets, Supervisor, open_reception, open_submitter
 
 
 def take_away(world: World) -> None:
@@ -55,7 +55,7 @@ def test_a_worker_whose_registry_is_gone_ends_and_says_so(
     place = RobotHome(world.path / "robot-1")
     join(place, read_bundle(world.register().bundle.read_bytes()))
     robot, roots = load_identity(place.identity, b"robot's")
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     reception = open_reception(
         0, load_server_config(world.home.config), load_server_identity(world.home, PASSPHRASE), world.home,
         Registry(world.home.registry), world.open_inbox(), world.home.deployment(),

@@ -16,7 +16,7 @@ import pytest
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
-from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
@@ -59,7 +59,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
     """Robots with nobody at the other end."""
     ca = ids.create_ca("operator", at=NOW)
     who = ids.enrol(ca, ids.Role.ROBOT, "robot_1", at=NOW)
-    [nobody] = server_sockets(("127.0.0.1", 0))
+    nobody = server_socket(("127.0.0.1", 0))
 
     def made(count: int) -> Robot:
         now = time.monotonic()

@@ -13,7 +13,7 @@ from rosbridge_eth.config import load_server_config
 from rosbridge_eth.errors import BridgeError, ChainError, StoreError
 from rosbridge_eth.operator.enrolment import load_server_identity
 from rosbridge_eth.server import supervisor
-from rosbridge_eth.server.supervisor import Secrets, Supervisor
+from rosbridge_eth.server.shard import Secrets, Supervisor
 
 
 @pytest.fixture

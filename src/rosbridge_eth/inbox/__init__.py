@@ -259,9 +259,9 @@ def _state(text: str | bytes | None) -> RobotState:
 
 
 def open_inbox(
-    url: str, *, home: Path, ledger: bytes, max_bytes: int, max_bytes_per_robot: int, read_only: bool = False
+    url: str, *, file: Path, ledger: bytes, max_bytes: int, max_bytes_per_robot: int, read_only: bool = False
 ) -> Inbox:
-    """The inbox at `url`, for one ledger (chunk.ledger_id): "sqlite", in the folder `home`, or a Redis.
+    """The inbox at `url`, for one ledger (chunk.ledger_id): "sqlite", in `file`, or a Redis.
 
     The bounds are on the rows as they travel. Where all robots' shares fit into max_bytes, none can take another's.
     read_only: nothing is made or changed; database.NothingThere where there is no inbox yet. StoreError.
@@ -269,7 +269,7 @@ def open_inbox(
     if url == "sqlite":
         from rosbridge_eth.inbox.sqlite import SqliteInbox
 
-        return SqliteInbox(home / "inbox.sqlite", ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
+        return SqliteInbox(file, ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
     from rosbridge_eth.inbox.redis import RedisInbox
 
     return RedisInbox(url, ledger, max_bytes, max_bytes_per_robot, read_only=read_only)

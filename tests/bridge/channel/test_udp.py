@@ -25,7 +25,7 @@ from rosbridge_eth.channel import (
     Unresolved,
     cookie_key,
 )
-from rosbridge_eth.channel.udp import ClientLoop, UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import ClientLoop, UdpLoop, client_socket, server_socket
 from rosbridge_eth.channel.wire import HELLO_PADDING, Hello, Kind, Mode
 from rosbridge_eth.errors import NetworkError
 
@@ -214,9 +214,9 @@ def test_a_name_is_asked_for_until_it_has_an_address_and_again_when_the_session_
     assert not robot.loop.resolved and robot.client.state == "idle"
     for number, place in enumerate([("127.0.0.1", 0), ("::1", 0)]):  # the second time, the server has moved
         try:
-            [sock] = server_sockets(place)
+            sock = server_socket(place)
         except (OSError, NetworkError):  # a machine without IPv6
-            [sock] = server_sockets(("127.0.0.1", 0))
+            sock = server_socket(("127.0.0.1", 0))
         worker = Worker(number, sock)
         names.address = worker.loop.socket.getsockname()[:2]
         robot.until(lambda: robot.client.state == "connected")
@@ -307,7 +307,7 @@ def test_a_hello_from_port_0_costs_one_datagram(workers):
     ids=lambda address: f"{address[0]} {address[1]}",
 )
 def test_a_datagram_that_cannot_be_sent_is_a_lost_datagram(address):
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     server = Server(ServerConfig(), HUB, TRUST, cookie_key(HUB), time.monotonic())
     loop = UdpLoop(server, sock, lambda event: None)
     hello = Hello(Mode.EXCHANGE, bytes(8), bytes(16)).datagram(Kind.HELLO, HELLO_PADDING)
@@ -338,7 +338,7 @@ class Socket:
 
 @pytest.mark.parametrize("code", [errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EMSGSIZE, errno.EIO])
 def test_news_of_the_network_does_not_end_a_loop(code):
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     server = Server(ServerConfig(), HUB, TRUST, cookie_key(HUB), time.monotonic())
     loop = UdpLoop(server, Socket(sock, recvfrom=code, sendto=code), lambda event: None)
     robot = Robot(ROBOTS[0], sock.getsockname()[1])
@@ -352,7 +352,7 @@ def test_news_of_the_network_does_not_end_a_loop(code):
 
 
 def test_a_socket_that_is_no_socket_any_more_is_an_error():
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     server = Server(ServerConfig(), HUB, TRUST, cookie_key(HUB), time.monotonic())
     loop = UdpLoop(server, Socket(sock, recvfrom=errno.EBADF), lambda event: None)
     Robot(ROBOTS[0], sock.getsockname()[1]).loop.step(0.0)

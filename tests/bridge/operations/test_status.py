@@ -30,7 +30,7 @@ from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.operator.status import span
 from rosbridge_eth.robot.loop import open_robot
 from rosbridge_eth.server import metrics
-from rosbridge_eth.server.supervisor import open_submitter
+from rosbridge_eth.server.shard import open_submitter
 
 TK = robot_id("robot_1")
 STREAM = b"s" * 16

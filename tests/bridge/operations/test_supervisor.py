@@ -17,13 +17,13 @@ import pytest
 
 import rosbridge_eth
 from bridge.operations.conftest import Place
-from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.errors import ExitCode, NetworkError, ProcessError, StoreError
 from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.server import metrics, supervisor
-from rosbridge_eth.server.supervisor import (
+from rosbridge_eth.server.shard import (
     GIVE_UP_AFTER,
     LONGEST_PAUSE,
     MONITOR,
