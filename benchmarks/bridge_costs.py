@@ -242,7 +242,7 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     robot = Robot(
         source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
         writer=who.writer(0.05, now), spool=spool, client=client, sender=sender,
-        server=Address("127.0.0.1", port),
+        servers=[Address("127.0.0.1", port)],
     )  # fmt: skip
     started = time.perf_counter()
     robot.run()

@@ -69,7 +69,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
                            stream_line=stream_line("bag", "test"), period=0.001, now=now)
         return Robot(source=Source(count), capture=Capture([TopicRule(TOPIC)], source_kind="bag"), writer=writer,
                      spool=spool, client=client, sender=Sender(client, spool),
-                     server=Address(*nobody.getsockname()[:2]))
+                     servers=[Address(*nobody.getsockname()[:2])])
 
     yield made
     nobody.close()

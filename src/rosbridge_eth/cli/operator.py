@@ -255,8 +255,8 @@ def register(
     ca = _ca(place, passphrase, ca_passphrase_file)
     with ledger_of(place) as ledger:
         made = register_robot(
-            place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place, name), now=utc_now(), request=asked,
-            password=secret, replace=replace, compromised=compromised,
+            place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place, name), now=utc_now(),
+            request=asked, password=secret, replace=replace, compromised=compromised,
         )  # fmt: skip
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if asked is None:

@@ -1,7 +1,6 @@
-"""The parent of the server's shards: opens their ports, starts a child for each, and starts one again that ended.
+"""The parent of the server's shards: checks chain and stores, starts a child for each shard, and again if it ended.
 
-Chain and stores are checked before a port opens. Children are forked, so no key travels through a pipe or an argument.
-A port stays open while its shard is started again, and what robots send meanwhile waits there.
+Children are forked, so that no key travels through a pipe or an argument.
 """
 
 from __future__ import annotations
@@ -73,7 +72,6 @@ class Parent:
         """only: the shards that run here, where the others run elsewhere."""
         self._home, self._secrets, self._only = home, secrets, only
         self._children: dict[int, Child] = {}
-        self._sockets: dict[Address, Socket] = {}
         self._stop, self._again = threading.Event(), threading.Event()
         self._at_terminal = os.isatty(0)
 
@@ -84,19 +82,20 @@ class Parent:
         self, on_ready: Callable[[list[Address]], None] = lambda addresses: None,
         on_look: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
-        """Check, open the ports, start the shards, start again what ends. Raises BridgeError before a port is open.
+        """Check, start the shards, start again what ends. Raises BridgeError where something is missing at the start.
 
         on_ready: called with the addresses that are listened on; on_look: after every look at the children.
         """
         config = self._checked()
-        self._open(config)  # a second server gets no further
+        addresses = [config.listen.next(shard) for shard in self._shards(config)]
+        for shard, address in zip(self._shards(config), addresses, strict=True):  # a second server gets no further
+            server_socket(address).close()
+            metrics.require_free(config.monitor and config.monitor.next(shard))
+        for signaled in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(signaled, self._on_signal)
         try:
-            for shard in self._shards(config):
-                metrics.require_free(config.monitor and config.monitor.next(shard))
-            for signaled in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-                signal.signal(signaled, self._on_signal)
             self._begin(config)
-            on_ready([Address(*sock.getsockname()[:2]) for sock in self._sockets.values()])
+            on_ready(addresses)
             notify("READY=1")
             while not self._stop.wait(WATCH):
                 if self._again.is_set():
@@ -108,8 +107,6 @@ class Parent:
         finally:
             notify("STOPPING=1")
             self._end()
-            for sock in self._sockets.values():
-                sock.close()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGHUP and os.isatty(0) == self._at_terminal:
@@ -135,21 +132,6 @@ class Parent:
                 store.check()
         return config
 
-    def _open(self, config: ServerConfig) -> None:
-        """Open the ports that are not open; NetworkError where one is taken. Close those that are not wanted."""
-        wanted = [config.listen.next(shard) for shard in self._shards(config)]
-        made = dict[Address, Socket]()
-        try:
-            for address in wanted:
-                made[address] = self._sockets.get(address) or server_socket(address)
-        except BridgeError:
-            for address in made.keys() - self._sockets.keys():
-                made[address].close()
-            raise
-        for address in self._sockets.keys() - made.keys():
-            self._sockets[address].close()
-        self._sockets = made
-
     def _begin(self, config: ServerConfig) -> None:
         for file in self._home.path.glob(".shard-*.prom"):  # of a server that was killed and had more of them
             if int(file.stem.rpartition("-")[2]) >= config.shards:
@@ -161,7 +143,6 @@ class Parent:
         """Begin anew by server.toml. What cannot be used is told, and nothing changes."""
         try:
             new = self._checked()
-            self._open(new)
         except BridgeError as error:
             log.error("nothing is reloaded: %s", error)
             return config
@@ -177,31 +158,29 @@ class Parent:
                 log.error("%s ended with exit code %s after %.0f s; it is started again in %.0f s",
                           name_of(shard), child.process.exitcode, now - child.since, child.pause)
             if child.due is not None and now >= child.due:
-                self._start(shard, child, config, now)
-
-    def _start(self, shard: int, child: Child, config: ServerConfig, now: float) -> None:
-        child.starts, child.since, child.due = child.starts + 1, now, None
-        task = (shard, config, self._home, self._secrets, self._sockets[config.listen.next(shard)])
-        child.process = _FORK.Process(target=_child, args=(os.getpid(), child.starts, *task), name=name_of(shard))
-        child.process.start()
-        log.info("%s started, process %d", name_of(shard), child.process.pid)
+                child.starts, child.since, child.due = child.starts + 1, now, None
+                task = (os.getpid(), child.starts, shard, config, self._home, self._secrets)
+                child.process = _FORK.Process(target=_child, args=task, name=name_of(shard))
+                child.process.start()
+                log.info("%s started, process %d", name_of(shard), child.process.pid)
 
     def _end(self) -> None:
-        running = {shard: child.process for shard, child in self._children.items() if child.process is not None}
-        for process in running.values():
+        """End the children in good order, and those that do not end within GRACE in any."""
+        running = [child.process for child in self._children.values() if child.process is not None]
+        for process in running:
             process.terminate()
         deadline = time.monotonic() + GRACE
-        for shard, process in running.items():
+        for process in running:
             process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():
-                log.error("%s does not end; it is killed", name_of(shard))
+                log.error("%s does not end; it is killed", process.name)
                 process.kill()
                 process.join()
 
 
 def _child(
-    parent: int, starts: int, shard: int, config: ServerConfig, home: OperatorHome, secrets: Secrets, sock: Socket
-) -> None:
+    parent: int, starts: int, shard: int, config: ServerConfig, home: OperatorHome, secrets: Secrets
+) -> None:  # fmt: skip
     """What the process of a shard does: until SIGTERM, or until its parent is no more, since nobody would end it."""
     asked = threading.Event()
     signal.signal(signal.SIGTERM, lambda number, frame: asked.set())
@@ -209,11 +188,10 @@ def _child(
         signal.signal(number, signal.SIG_IGN)
     try:
         metrics.STARTS.labels(name_of(shard)).set(starts)
-        run_shard(shard, config, home, secrets, sock, lambda: asked.is_set() or os.getppid() != parent)
+        run_shard(shard, config, home, secrets, lambda: asked.is_set() or os.getppid() != parent)
     except BridgeError as error:
         log.error("%s", error)
         raise SystemExit(int(error.exit_code)) from error
     except Exception as error:  # the end of the process: its last words belong into the log, as one event
         log.critical("a defect ended this process", exc_info=True)
         raise SystemExit(int(ExitCode.FAILED)) from error
-    raise SystemExit(int(ExitCode.OK))

@@ -14,11 +14,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from socket import socket as Socket
 from typing import TYPE_CHECKING
 
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.config.home import OperatorHome, shard_of
 from rosbridge_eth.errors import StoreError
@@ -142,15 +141,16 @@ class Shard:
 
 
 def run_shard(
-    shard: int, config: Settings, home: OperatorHome, secrets: Secrets, sock: Socket, stopped: Callable[[], bool]
+    shard: int, config: Settings, home: OperatorHome, secrets: Secrets, stopped: Callable[[], bool]
 ) -> None:
-    """A shard on its socket, as a process of its own."""
+    """A shard, as a process of its own. Raises BridgeError where a part cannot be had, or is exchanged."""
     name, file = name_of(shard), metrics.file_of(home.path, name_of(shard))
     store, reception = open_store(config, home, shard), open_reception(
         config, secrets.identity, home, Registry(home.registry), open_store(config, home, shard), shard
     )
     registry, ledger = Registry(home.registry), Ledger.connect(config.chain.url, home.deployment())
     submitter = open_submitter(config, ledger, store, registry, secrets.keys, shard)  # which has its own of all
+    sock = server_socket(config.listen.next(shard))
     made = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
     beats = metrics.Beats()
 

@@ -22,7 +22,7 @@ from rosbridge_eth.robot.loop import reader_keys
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 CA, OTHER_CA = (ids.create_ca("CA", at=NOW - timedelta(days=1000)) for _ in range(2))
 READER = ids.enrol(CA, Role.READER, "owner", at=NOW).public
-END = BridgeEnd("robot_1", "server", "192.0.2.7:7410", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+END = BridgeEnd("robot_1", "server", ["192.0.2.7:7410"], 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 
 
 def answer(
@@ -121,8 +121,8 @@ def test_keys_that_are_certified_anew_join_again_and_another_ledger_does_not(hom
     request = ask_to_join(home, "robot_1", b"robot's")
     join(home, answer(request))
     home.config.write_text('topics = ["/mine"]\n')
-    join(home, answer(request, end=replace(END, server_address="192.0.2.8:7410")))
-    assert home.bridge().server_address == "192.0.2.8:7410" and "/mine" in home.config.read_text()
+    join(home, answer(request, end=replace(END, servers=["192.0.2.8:7410"])))
+    assert home.bridge().servers == ["192.0.2.8:7410"] and "/mine" in home.config.read_text()
     with pytest.raises(ConfigError, match="another ledger"):
         join(home, answer(request, end=replace(END, chain_id=1)))
 
@@ -205,7 +205,7 @@ def test_a_reader_who_is_added_to_a_bundle_on_its_way_is_refused(home: RobotHome
     changes: list[dict[str, object]] = [
         {"readers": {"owner": owner, "revoked": revoked}}, {"readers": {"owner": revoked}}, {"readers": {}},
         {"signature": ""}, {"signature": "00" * 64}, {"signature": "zz"}, {"signature": bundle.signature[2:]},
-        {"end": asdict(replace(END, server_address="192.0.2.66:7410"))}, {"end": asdict(replace(END, chain_id=5))},
+        {"end": asdict(replace(END, servers=["192.0.2.66:7410"]))}, {"end": asdict(replace(END, chain_id=5))},
     ]
     for change in changes:
         with pytest.raises(IdentityError, match="not what the CA signed"):

@@ -21,6 +21,7 @@ from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server import metrics
 from rosbridge_eth.server.reception import Worker
 from rosbridge_eth.server.shard import open_reception, open_store
 
@@ -56,6 +57,13 @@ class Place:
         text = self.operator.config.read_text()
         assert old in text
         self.operator.config.write_text(text.replace(old, new))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_counted() -> None:
+    """The figures of a process, which are those of one test here."""
+    for gauge in set(metrics.REGISTRY._names_to_collectors.values()):
+        gauge.clear()  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="session")
@@ -102,8 +110,7 @@ def server(place: Place) -> Iterator[Address]:
     config, registry = load_server_config(place.operator.config), Registry(place.operator.registry)
     sock = server_socket(config.listen)
     reception = open_reception(
-        0, config, admin.load_server_identity(place.operator, PASSPHRASE), place.operator, registry, place.inbox(),
-        place.operator.deployment(),
+        config, admin.load_server_identity(place.operator, PASSPHRASE), place.operator, registry, place.inbox()
     )
     worker, stop = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), threading.Event()
     thread = threading.Thread(target=worker.run, args=(stop.is_set,))

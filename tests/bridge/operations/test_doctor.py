@@ -151,7 +151,7 @@ ODOM = 'topics = ["/robot_1/odom"]\n'
     ("operator", lambda p: (p / "operator/server.toml").write_text("listen = 1"), "configuration", ""),
     ("operator", lambda p: (p / "operator/registry.sqlite").write_bytes(b"no database" * 999), "registry", "backup"),
     ("operator", lambda p: (p / "pass").write_bytes(b"another"), "passphrase", ""),
-    ("operator", lambda p: (p / "operator/inbox.sqlite").write_bytes(b"no database" * 999), "store", ""),
+    ("operator", lambda p: (p / "operator/store-0.sqlite").write_bytes(b"no database" * 999), "store", ""),
     ("reader", lambda p: (p / "readers").write_bytes(b"another"), "keys", ""),
     ("reader", lambda p: (p / "reader/reader.toml").write_text("x = 1"), "node", ""),
 ])
@@ -385,7 +385,7 @@ def test_an_address_that_is_none_is_found_at_both_ends(place: Place, capsys: Cap
     _, findings = doctor(capsys)
     assert any("public =" in f["found"] + f["mend"] for f in findings if f["result"] == "broken")
     end = place.robot.bridge()
-    place.robot.save_bridge(replace(end, server_address="0.0.0.0:7410"))
+    place.robot.save_bridge(replace(end, servers=["0.0.0.0:7410"]))
     _, findings = doctor(capsys, "--home", "robot")
     assert of(findings, "bridge")["result"] == "broken" and "robot.toml" in of(findings, "bridge")["mend"]
     place.robot.config.write_text(f'server = "192.0.2.1:7410"\n{ODOM}')
