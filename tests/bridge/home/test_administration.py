@@ -497,7 +497,7 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
             with pytest.raises(ChainError, match=r"half done: .* run `revoke robot_1` again"):
                 world.revoke()
     with monkeypatch.context() as patched:
-        patched.setattr(world, "open_inbox", partial(open_inbox, "redis://127.0.0.1:9", home=world.home.path,
+        patched.setattr(world, "open_inbox", partial(open_inbox, "redis://127.0.0.1:9", file=world.home.path,
                                                      ledger=bytes(32), max_bytes=1, max_bytes_per_robot=1))
         with pytest.raises(StoreError, match=r"half done: .* run `revoke robot_1` again"):
             world.revoke()

@@ -173,12 +173,13 @@ def test_a_request_that_was_altered_is_refused() -> None:
     {"end": {}}, {"end": 5}, {"readers": {"../x": "pem"}}, {"certificates": 7}, {"keys": None}, {"readers": [5]},
     {"readers": {"owner": 5}}, {"certificates": {"sign.crt.pem": 5}}, {"keys": {"sign.key.pem": None}},
     {"end": asdict(END) | {"genesis": "0x1"}}, {"end": asdict(END) | {"chain_id": "one"}},
-    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"server_address": None}}, {"signature": 7},
+    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"servers": None}},
+    {"end": asdict(END) | {"servers": []}}, {"signature": 7},
     {"end": asdict(END) | {"contract": "0x" + "22 " * 20}}, {"end": asdict(END) | {"server_name": "a\x1b[2Jb"}},
-    {"end": asdict(END) | {"server_name": "\u202eb"}}, {"end": asdict(END) | {"server_address": "\x1b[2J:7410"}},
-    *({"end": asdict(END) | {"server_address": f"{host}:7410"}} for host in (
+    {"end": asdict(END) | {"server_name": "\u202eb"}}, {"end": asdict(END) | {"servers": ["\x1b[2J:7410"]}},
+    *({"end": asdict(END) | {"servers": ["192.0.2.7:7410", f"{host}:7410"]}} for host in (
         "0.0.0.0", "[::]", "0", "0x0", "00.00.0.0", "[::0]", "[0:0:0:0:0:0:0:0]", "[::ffff:0.0.0.0]", "[::ffff:0:0]")),
-    {"end": asdict(END) | {"server_address": "192.0.2.7:0"}},
+    {"end": asdict(END) | {"servers": ["192.0.2.7:0"]}},
 ])
 def test_a_bundle_that_was_damaged_is_refused(change: dict[str, object]) -> None:
     bundle = answer(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))))

@@ -284,7 +284,7 @@ class Stranger(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b'{"conditions": 3}', b"\xff", b'{"conditions": {}}'])
+@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b"up 1\n", b"\xff", b"up\n", b"a{b"])
 def test_another_web_server_in_the_monitors_place_is_broken(
     place: Place, server: Address, answer: bytes, capsys: Capture
 ):
@@ -312,7 +312,7 @@ def test_a_server_without_its_monitor_is_broken_and_one_that_is_not_ready_too(
     place.configure("\n[chain]", f'monitor = "127.0.0.1:{free}"\n[chain]')
     _, findings = doctor(capsys)
     assert "not answered" in of(findings, "monitor port")["found"]
-    answer = json.dumps({"ok": False, "conditions": {"node answers": False, "worker-0 runs": True}}).encode()
+    answer = b'rosbridge_eth_condition{process="shard-0",name="node answers"} 0.0\n'
     http = HTTPServer(("127.0.0.1", free), type("Answer", (Stranger,), {"answer": answer}))
     thread = threading.Thread(target=http.serve_forever, args=(0.05,))
     thread.start()
