@@ -5,8 +5,8 @@ at which it was begun. A robot is named by its Tk. Its *head* is the place up to
 where it is when rows are removed.
 
 The rule: a chunk is taken if it follows the head: its `previous` is the digest there, or the robot says that it has
-nothing else behind that digest. So whoever sends is told the head, and sends what follows it; a replica that was lost, or put
-back from an old copy, says a lower head and is sent the rest.
+nothing else behind that digest. So whoever sends is told the head, and sends what follows it; a replica that was lost,
+or put back from an old copy, says a lower head and is sent the rest.
 
 Rows up to the confirmed place are on the chain, and kept for some time, since the chain may still turn back. Every
 write is named by its place, so that one that is carried out twice changes nothing. `now` is seconds since 1970.
