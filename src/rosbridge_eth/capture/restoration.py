@@ -16,8 +16,8 @@ import numpy
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from rosbridge_eth.capture.conversion import BYTES, NUMPY
-from rosbridge_eth.capture.definitions import DURATION, HEADER, TIME, check_types, write_text
+from rosbridge_eth.capture.conversion import BYTES
+from rosbridge_eth.capture.definitions import DURATION, HEADER, NUMBERS, TIME, check_types, write_text
 from rosbridge_eth.capture.messages import Decoder, Wire
 from rosbridge_eth.errors import SourceError, VerificationError
 
@@ -96,8 +96,8 @@ class Restoration:
     def _value(self, description: FieldDesc, path: str) -> Builder:
         if description[0] == Nodetype.BASE:
             if description[1][0] == "string":
-                return _leaf(path, str, partial(_exactly, str), _is_digest)
-            kind = numpy.dtype(NUMPY[description[1][0]])
+                return _leaf(path, str, partial(_exactly, str))
+            kind = NUMBERS[description[1][0]]
             # A byte is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed.
             read = _signed if description[1][0] == "byte" else partial(_checked, kind)
             return _leaf(path, lambda: kind.type(0).item(), read)
@@ -108,38 +108,8 @@ class Restoration:
         element, count = description[1]
         length = count if description[0] == Nodetype.ARRAY else None
         if element[0] == Nodetype.BASE and element[1][0] != "string":
-            return self._numbers(element[1][0], length, path)
-        return self._list(self._value(element, f"{path}[*]"), length, path)
-
-    def _numbers(self, base: str, length: int | None, path: str) -> Builder:
-        kind, binary = numpy.dtype(NUMPY[base]), base in BYTES
-
-        def read(data: Any) -> Any:
-            if binary:
-                array = numpy.frombuffer(b64decode(data, validate=True), kind)
-            else:
-                array = numpy.array([_checked(kind, item) for item in _exactly(list, data)], kind)
-            if length is not None and len(array) != length:
-                raise ValueError
-            return array
-
-        # In place of numbers, single elements may stand in an object.
-        stands_in = _is_digest if binary else lambda data: isinstance(data, dict)
-        return _leaf(path, lambda: numpy.zeros(length or 0, kind), read, stands_in)
-
-    def _list(self, builder: Builder, length: int | None, path: str) -> Builder:
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT or isinstance(data, dict):  # a digest, or single elements
-                missing.append(path)
-                return [builder(_ABSENT, []) for _ in range(length or 0)]
-            if not isinstance(data, list) or (length is not None and len(data) != length):
-                raise _unfit(path, data)
-            below: list[str] = []
-            items = [builder(item, below) for item in data]
-            missing.extend(dict.fromkeys(below))
-            return items
-
-        return build
+            return _numbers(element[1][0], length, path)
+        return _list(self._value(element, f"{path}[*]"), length, path)
 
     def _instant(self, type_name: str, path: str) -> Builder:
         make = self.decoder.typestore.types[type_name]
@@ -156,19 +126,47 @@ class Restoration:
         return _leaf(path, lambda: make(0, 0), read)
 
 
-def _leaf(
-    path: str, zero: Callable[[], Any], read: Callable[[Any], Any], stands_in: Callable[[Any], bool] | None = None
-) -> Builder:
-    """The builder of a field without fields. stands_in: whether what is there is not the value, but in its place."""
+def _leaf(path: str, zero: Callable[[], Any], read: Callable[[Any], Any]) -> Builder:
+    """The builder of a field without fields. An object stands there for a value: a digest, or single elements."""
 
     def build(data: Any, missing: list[str]) -> Any:
-        if data is _ABSENT or (stands_in is not None and stands_in(data)):
+        if data is _ABSENT or isinstance(data, dict):
             missing.append(path)
             return zero()
         try:
             return read(data)
         except (TypeError, ValueError):
             raise _unfit(path, data) from None
+
+    return build
+
+
+def _numbers(base: str, length: int | None, path: str) -> Builder:
+    kind, binary = NUMBERS[base], base in BYTES
+
+    def read(data: Any) -> Any:
+        if binary:
+            array = numpy.frombuffer(b64decode(data, validate=True), kind)
+        else:
+            array = numpy.array([_checked(kind, item) for item in _exactly(list, data)], kind)
+        if length not in (None, len(array)):
+            raise ValueError
+        return array
+
+    return _leaf(path, lambda: numpy.zeros(length or 0, kind), read)
+
+
+def _list(builder: Builder, length: int | None, path: str) -> Builder:
+    def build(data: Any, missing: list[str]) -> Any:
+        if data is _ABSENT or isinstance(data, dict):  # as of a leaf
+            missing.append(path)
+            return [builder(_ABSENT, []) for _ in range(length or 0)]
+        if not isinstance(data, list) or length not in (None, len(data)):
+            raise _unfit(path, data)
+        below: list[str] = []
+        items = [builder(item, below) for item in data]
+        missing.extend(dict.fromkeys(below))
+        return items
 
     return build
 
@@ -212,10 +210,6 @@ def _checked(kind: numpy.dtype[Any], data: Any) -> Any:
     if not fits:
         raise ValueError
     return data
-
-
-def _is_digest(data: Any) -> bool:
-    return isinstance(data, dict) and data.keys() == {"sm3", "length"}
 
 
 def _unfit(path: str, data: Any) -> VerificationError:
