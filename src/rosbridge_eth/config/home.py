@@ -213,7 +213,8 @@ class OperatorHome:
     def account(self) -> str:
         """The operator's account on the chain, which accounts.json shows in the clear."""
         fix = "restore it from your backup"
-        return str(_load(dict[str, Any], self.accounts, fix, ConfigError(f"{self.accounts} is missing; {fix}"))["operator"])
+        absent = ConfigError(f"{self.accounts} is missing; {fix}")
+        return str(_load(dict[str, Any], self.accounts, fix, absent)["operator"])
 
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""
