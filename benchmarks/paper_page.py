@@ -159,8 +159,10 @@ def _scale(figures: Figures) -> Any:
 def page(figures: Figures) -> str:
     """docs/evaluation.md."""
     sections = [_head(figures)]
-    for name, make in (("user", _user_section), ("server", _server_section), ("chain", _chain_section),
-                       ("bridge", _bridge_section), ("baseline", _baseline_section), ("scale", _scale_section)):  # fmt: skip
+    for name, make in (
+        ("user", _user_section), ("server", _server_section), ("chain", _chain_section), ("bridge", _bridge_section),
+        ("baseline", _baseline_section), ("scale", _scale_section),
+    ):  # fmt: skip
         if name in figures or name in ("chain", "bridge"):
             sections.append(make(figures))
     return "\n\n".join(filter(None, sections)) + "\n"
@@ -333,9 +335,9 @@ that is deeper is healed by the same rule, for a day; what was told as confirmed
 
 GIVES = (
     ("who can read a record", "whoever reads the log", "the readers whom the robot named, by their keys"),
-    ("who can prove whose it is", "nobody: the log's operator names the robot", "every reader, by the robot's signature"),
-    ("who can change or leave out a record unseen", "the operator, until the next anchor; whoever holds log and anchor "
-     "together, never", "nobody: the robot links and signs its chunks"),
+    ("who can prove whose it is", "nobody: the operator says so", "every reader, by the robot's signature"),
+    ("who can change or leave out a record unseen", "the operator, before it is anchored",
+     "nobody: the robot signs its chunks, each with the digest of the one before"),
     ("what is left if the log's machines burn", "the anchors: that something was there", "every record, on the chain"),
     ("what a record costs on the chain", "a share of the anchor", "its bytes"),
     ("30 % loss, weeks without a network", "TCP; the robot's program has to keep what it cannot send",
@@ -348,11 +350,11 @@ def _baseline_section(figures: Figures) -> str:
     head = ["", "Redis Streams and anchor", "the bridge"]
     return f"""## Beside an ordinary replicated log
 
-The same {part["records"]:,} records into a stream of a Redis with one replica (both fsync every write, and a batch of
-{part["per_batch"]} is acknowledged by both), with SHA-256 of all of it written to the chain once a batch; and through the
-bridge, {part["per_batch"]} records to a chunk ([benchmarks/baseline.py](../benchmarks/baseline.py)). The server's column
-holds Redis, replica and anchorer on one side, reception and commit on the other; the submitter's time is in the model
-below.
+The same {part["records"]:,} records, captured alike, in two ways: into a stream of a Redis with one replica, which both
+fsync every write and acknowledge every batch of {part["per_batch"]}, with SHA-256 of the whole stream written to the
+chain once a batch; and through the bridge, {part["per_batch"]} records to a chunk
+([benchmarks/baseline.py](../benchmarks/baseline.py)). "Server" is Redis, its replica and the anchorer on one side,
+reception and commit on the other; the submitter's time is in the model below.
 
 {table(head, baseline.rows(part))}
 
