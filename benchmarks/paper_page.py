@@ -137,14 +137,15 @@ def _scale(figures: Figures) -> Any:
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
     needs = figures["scale"]["needs"]
     for axis, key, unit in zip(axes, ("cores", "bytes_a_day", "gas_a_second"),
-                               ("cores of workers and submitter", "GB a day on the chain", "M gas a second"),
+                               ("cores of shards, submitters among them", "GB a day on the chain", "M gas a second"),
                                strict=True):  # fmt: skip
         for rate in scale.RATES:
             own = [need for need in needs if need["rate"] == rate]
             values = [need["cores"] + need["submitter_cores"] if key == "cores" else
                       need[key] / (1e9 if key == "bytes_a_day" else 1e6) for need in own]  # fmt: skip
             axis.plot([need["robots"] for need in own], values, marker="o", markersize=3, label=f"{rate} messages/s")
-        axis.set(xscale="log", yscale="log", xlabel="robots", ylabel=unit)
+        axis.axvline(max(row["sessions"] for row in figures["scale"]["compared"]), color="0.3", linestyle=":")
+        axis.set(xscale="log", yscale="log", xlabel="robots (right of the dotted line: not run)", ylabel=unit)
     for gas in sorted(set(scale.CHAINS.values())):
         axes[2].axhline(gas / 1e6, color="0.5", linewidth=0.8, linestyle="--")
         names = ", ".join(name for name, own in scale.CHAINS.items() if own == gas)
@@ -369,34 +370,30 @@ def _scale_section(figures: Figures) -> str:
     costs, compared = part["costs"], part["compared"]
     rows = [
         (f"{row['sessions']:,} robots, {row['messages']:,} messages" + (", calibrating" if row["calibrating"] else ""),
-         f"{row['workers_ms'] / 1000:.2f}", f"{row['model_ms'] / 1000:.2f}", f"{row['submitter_ms'] / 1000:.2f}",
+         f"{row['shard_ms'] / 1000:.2f}", f"{row['model_ms'] / 1000:.2f}", f"{row['submitter_ms'] / 1000:.2f}",
          f"{row['submitter_model_ms'] / 1000:.2f}", f"{row['equal']:,}", f"{row['lost']} / {row['doubled']}")
         for row in compared
     ]  # fmt: skip
-    limits = [
-        (name, *(f"{held[str(rate)][what]:,}" for rate in scale.RATES for what in ("whole", "headers", "roots")))
-        for name, held in part["limits"].items()
-    ]
-    head = ["the most robots", *(f"{rate}/s, {what}" for rate in scale.RATES
-                                 for what in ("whole", "headers anchored", "roots anchored"))]  # fmt: skip
+    limits = [(name, *(f"{held[str(rate)]:,}" for rate in scale.RATES)) for name, held in part["limits"].items()]
+    head = ["the most robots", *(f"{rate} messages/s each" for rate in scale.RATES)]
+    tried = max(row["sessions"] for row in compared)
     assumed = "\n".join(f"- {line}" for line in scale.ASSUMED)
     return f"""## Past this machine
 
 A model ([benchmarks/scale.py](../benchmarks/scale.py)), calibrated by: {costs["record_ms"]:.4f} ms a record,
-{costs["chunk_ms"]:.2f} ms a chunk, {costs["handshake_ms"]:.1f} ms a handshake in the workers,
-{costs["submitted_ms"]:.2f} ms a chunk in the submitter, {costs["record_bytes"]:.0f} bytes a record,
-{costs["chunk_bytes"]:.0f} a chunk, {costs["session_kib"]:.0f} KiB of memory a session.
+{costs["chunk_ms"]:.2f} ms a chunk, {costs["handshake_ms"]:.1f} ms a handshake in a shard,
+{costs["submitted_ms"]:.2f} ms a chunk and {costs["quiet_ms"]:.3f} ms a registered robot and second in its submitter,
+{costs["record_bytes"]:.0f} bytes a record, {costs["chunk_bytes"]:.0f} a chunk, {costs["session_kib"]:.0f} KiB of memory
+a session. What lies to the right of the dotted line, at {tried:,} robots, was not run.
 
 {assumed}
 
 ![Cores, bytes and gas by number of robots](evaluation-scale.svg)
 
-Where a line of the right picture crosses a chain's, that chain holds no more robots, and chunks must be anchored
-instead of written whole:
+A chain holds so many robots, and one shard's submitter bears so many:
 
 {table(head, limits)}
 
-Held to runs of this machine, processor time in seconds. What a session costs that says nothing (looks for what the
-operator and the submitter changed, and its figures, once a second) is not in the model:
+Held to runs of this machine, processor time in seconds. What a session costs that says nothing is not in the model:
 
-{table(["", "workers", "model", "submitter", "model", "proven and equal", "lost / doubled"], rows)}"""
+{table(["", "shard", "model", "submitter", "model", "proven and equal", "lost / doubled"], rows)}"""
