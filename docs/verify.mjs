@@ -399,7 +399,7 @@ whole &&= linked.hash === standing.certificatesHash && linked.revoked === standi
 if (!whole || linked.block !== Number(standing.changedBlock)) told('withheld', end, 'a registration')
 const signers = []
 for (const event of registrations) {
-  const one = { index: Number(event.args.index), block: event.blockNumber, revoked: event.eventName === 'Revoked' }
+  const one = { index: Number(event.args.index), block: event.blockNumber, revoked: event.eventName === 'Revoked', fingerprint: '' }
   if (!one.revoked) {
     const certificates = getBytes(event.args.certificates)
     one.fingerprint = hex(digest(firstOf(certificates)))
@@ -424,9 +424,10 @@ function follow(header, at) {
   const ahead = header.number - (same ? head.number + 1n : 0n)
   const follows = header.previous === (head === null ? ZEROS : head.digest)
   const knowsNone = !same && header.number === 0n && header.previous === ZEROS
+  const goesBack = head !== null && (same ? head.goodbye : stream < head.stream)
   if (seen.has(header.digest)) throw new Wrong('forked', `the chunk of index ${seen.get(header.digest)} once more`)
-  if (ahead !== 0n || !(follows || knowsNone)) {
-    if (seen.has(header.previous) || (same && ahead <= 0n)) told('forked', at)
+  if (ahead !== 0n || goesBack || !(follows || knowsNone)) {
+    if (goesBack || seen.has(header.previous) || (same && ahead <= 0n)) told('forked', at)
     else told('missing', at, '', Number(ahead) || 1)
   }
   if (head !== null && !same && (knowsNone || !head.goodbye)) told('restarted', at)
