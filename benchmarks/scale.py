@@ -27,7 +27,7 @@ DAY = 86_400
 BATCH = 96 * 1024  # bytes of chunks in a transaction, at most
 ANCHOR_EVERY = 60.0
 SET_ROOT_GAS = 53_500  # for any number of chunks of a robot; DESIGN section 3, not written yet
-HEADER = 192 + 64 + 121  # bytes of a chunk's header, signature and one grant: what is anchored without its body
+HEADER = 139 + 64 + 113  # bytes of a chunk's header, signature and one grant: what is anchored without its body
 
 CHAINS: dict[str, float] = {
     "Clique as tested here": 30e6 / 1,
