@@ -118,9 +118,9 @@ class SqliteStore(Store):
     def _append(self, offers: Sequence[tuple[Offer, bytes]], now: float) -> list[Outcome]:
         [(total,)] = self._read("SELECT coalesce(sum(bytes), 0) FROM robot")
         full, outcomes = set[bytes](), list[Outcome]()
-        for (tk, chunk, oldest), hash in offers:
+        for (tk, chunk, after), hash in offers:
             (state, held), header, size = self._robot(tk), chunk.header, len(chunk.encoded)
-            outcome = self._judge(tk, state, header, oldest or tk in full)
+            outcome = self._judge(tk, state, header, state.digest if tk in full else after)
             if outcome is Outcome.STORED:
                 if tk in full or held + size > self.max_bytes_per_robot or total + size > self.max_bytes:
                     outcome = Outcome.FULL
@@ -134,7 +134,7 @@ class SqliteStore(Store):
             outcomes.append(outcome)
         return outcomes
 
-    def _judge(self, tk: bytes, state: State, header: Header, oldest: bool) -> Outcome:
+    def _judge(self, tk: bytes, state: State, header: Header, after: bytes) -> Outcome:
         """What the rule says of a chunk (see `Store.append`) where there is room for it."""
         place = place_of(header)
         there = self._read("SELECT digest FROM chunk WHERE tk = ? AND place = ?", tk, place)
@@ -149,7 +149,7 @@ class SqliteStore(Store):
             named = self._read("SELECT place FROM chunk WHERE tk = ? AND digest = ?", tk, header.previous)
             if place == successor(state.head) or (named and self._between(tk, state.head, named[0][0], place)):
                 return Outcome.DIFFERENT
-            if not oldest:
+            if after != state.digest:
                 return Outcome.NOT_NEXT
         return Outcome.KNOWN if there else Outcome.STORED
 
