@@ -169,8 +169,10 @@ class Sender:
 
     def _note(self, state: ServerState) -> None:
         """Take from the disk what is confirmed, and set aside what is refused."""
-        self.confirmed += self._spool.confirmed(state.confirmed)
-        self._spool.stored(state.head)
+        if self._written(state.confirmed):  # else another machine wrote it, and not what stands below it here
+            self.confirmed += self._spool.confirmed(state.confirmed)
+        if self._written(state.head) or (self._noted is not None and state.head < self._noted.head):
+            self._spool.stored(state.head)
         if state.refused != NO_DIGEST and (place := self._spool.set_aside(state.refused)):
             self.refused += 1
             log.error(
@@ -179,6 +181,11 @@ class Sender:
             )  # fmt: skip
             if place[:STREAM_SIZE] == self._writer.stream:
                 self._writer.new_stream()
+
+    def _written(self, place: bytes) -> bool:
+        """Whether the chunk there is this robot's own; not known of one that has left the disk."""
+        before = max(0, int.from_bytes(place, "big") - 1).to_bytes(len(place), "big")
+        return place in (NOWHERE, self._spool.newest, *(row.place for row in self._spool.rows(before, 1)))
 
     def _fork(self, place: bytes, now: float) -> None:
         """Send nothing more, but once the chunk at `place`, so that the server knows, too."""
