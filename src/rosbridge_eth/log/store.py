@@ -171,10 +171,14 @@ class Store(Protocol):
         """Remove confirmed rows that were taken before that time, or are beyond `keep` bytes, the oldest first; the
         newest confirmed one stays."""
         [state], size = self.states([tk]), self.sizes().get(tk, 0)
-        while gone := [
-            row for row in self.rows(tk, NOWHERE, 200)
-            if row.place < state.confirmed and (row.taken_at < before or size > keep)
-        ]:  # fmt: skip
-            size -= sum(row.size for row in gone)
+        while True:
+            gone: list[Row] = []
+            for row in self.rows(tk, NOWHERE, 200):  # from the front alone: a clock that was put back leaves no gap
+                if row.place >= state.confirmed or (row.taken_at >= before and size <= keep):
+                    break
+                gone.append(row)
+                size -= row.size
+            if not gone:
+                return
             self.set_state(tk, base=gone[-1].hash)
             self.remove(tk, [row.place for row in gone])
