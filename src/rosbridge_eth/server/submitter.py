@@ -45,8 +45,8 @@ SEND_BYTES = 2**22  # of transactions, handed to the node at once
 TOP_UPS = 20  # sent together; the next ones when all of them are in blocks
 ROWS = IN_FLIGHT * BATCH_BYTES // 203  # no chunk is smaller than 203 bytes
 _MOST = contract.BALANCE_LIMIT // 2  # that is waited for on an account
-MINUTE, DAY = 60.0, 86_400.0
-BURST = 3600.0  # seconds of a robot's gas that it may use at once
+MINUTE, HOUR, DAY = 60.0, 3600.0, 86_400.0
+BURST = HOUR  # seconds of a robot's gas that it may use at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class Submitter:
         self._funds, self._paid = Account(), list[Standing]()
         self._fees = Fees(0, 0)
         self._pause = IDLE
-        self._looked_at = self._minute_at = 0.0
+        self._looked_at = self._minute_at = self._hour_at = 0.0
         self.asked: set[bytes] = set()  # robots at which it looked, so that the store knows what the chain has of them
         self.trouble: str | None = None  # why nothing can be written at all
         self.unconfirmed: str | None = None  # why nothing can be confirmed
@@ -171,9 +171,12 @@ class Submitter:
         return BUSY if busy else IDLE
 
     def _forget(self, now: float) -> None:
-        """Confirmed rows that are a day old, or fill half of a robot's share."""
-        for tk in self.standings.keys() & self._store.sizes().keys():
-            self._store.forget(tk, now - DAY, self._store.max_bytes_per_robot // 2)
+        """Confirmed rows that are a day old, looked for once an hour, or fill half of a robot's share."""
+        half, hour = self._store.max_bytes_per_robot // 2, not 0 <= now - self._hour_at < HOUR
+        self._hour_at = now if hour else self._hour_at
+        for tk, size in self._store.sizes().items():
+            if tk in self.standings and (hour or size > half):
+                self._store.forget(tk, now - DAY, half)
 
     # ------------------------------------------------------------------ look
 

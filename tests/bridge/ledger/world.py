@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from bridge.ledger.memory_store import MemoryStore
 from bridge.ledger.model_chain import ModelChain
 from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.log.sqlite import SqliteStore
 from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, State, place_of
 from rosbridge_eth.server.submitter import Settings, Submitter
 from smcrypto import sm2
@@ -69,6 +71,13 @@ class Pen:
         return self.offers([chunk for chunk in self.disk if place_of(chunk.header) > state.head])
 
 
+def copy_file(source: Path, target: Path) -> Path:
+    """SQLite's online backup, which is also its restore where somebody uses the target."""
+    with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
+        one.backup(other)
+    return target
+
+
 class World:
     """A chain with the contract, robots registered and funded, a store, a submitter; `now` is the time."""
 
@@ -76,7 +85,7 @@ class World:
         """ledger: one with the contract; otherwise a model chain (model_chain.py)."""
         self.folder, self.now = folder, 1_700_000_000.0
         self.pens = [Pen(f"robot_{n}", n) for n in range(1, robots + 1)]
-        self.settings = Settings(**settings)
+        self.settings, self.stores = Settings(**settings), 0
         self.chain = ModelChain() if ledger is None else None
         self.ledger = ledger or self.chain
         for pen in self.pens:
@@ -104,10 +113,26 @@ class World:
         """Transactions that are sent and in no block yet."""
         return sum(len(account.flights) for account in self.submitter._known.values())
 
-    def new_store(self, store: MemoryStore | None = None) -> None:
-        """An empty one, or this one, and a submitter that begins with it."""
-        self.store = store or MemoryStore()
+    def new_store(self, path: Path | None = None) -> None:
+        """An empty one, or the one at this path, and a submitter that begins with it."""
+        self.stores += 1
+        self.path = path or self.folder / f"store-{self.stores}"
+        self.store = SqliteStore(self.path, LEDGER_ID, 10**9, 10**8)
         self.restart()
+
+    def copy(self) -> Path:
+        """The store as it is now."""
+        self.stores += 1
+        return copy_file(self.path, self.folder / f"copy-{self.stores}")
+
+    def put_back(self, copy: Path) -> None:
+        """A copy in place of the store, under those who use it."""
+        copy_file(copy, self.path)
+
+    def lose(self) -> None:
+        """The store's file is deleted under those who use it."""
+        for suffix in ("", "-wal", "-shm"):
+            Path(f"{self.path}{suffix}").unlink(missing_ok=True)
 
     def restart(self) -> Submitter:
         """A new submitter, which remembers nothing."""
