@@ -43,12 +43,12 @@ from pathlib import Path
 from typing import Any
 
 import requests
+from rosbridge_eth.inbox import Inbox
+from rosbridge_eth.inbox.sqlite import SqliteInbox
 
 import geth_network
 from ports import free_port
 from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.inbox import Inbox
-from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.nodes import Anvil

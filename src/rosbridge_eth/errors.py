@@ -44,7 +44,7 @@ class IdentityError(BridgeError, exit_code=ExitCode.IDENTITY):
 
 
 class StoreError(BridgeError, exit_code=ExitCode.STORE):
-    """The spool, inbox or journal cannot be opened or written, or belongs to another chain."""
+    """The spool, store or registry cannot be opened or written, or belongs to another chain."""
 
 
 class NetworkError(BridgeError, exit_code=ExitCode.NETWORK):

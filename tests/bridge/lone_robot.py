@@ -10,12 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rosbridge_eth.spool import Spool
+
 import rosbridge_eth
 from rosbridge_eth import identity as ids
 from rosbridge_eth.config.home import BridgeEnd, RobotHome
 from rosbridge_eth.log.chunk import Chunk, Log, NoGrant, content_key, drop, open_lines, robot_id
 from rosbridge_eth.operator.bundle import Bundle, ask_to_join, join
-from rosbridge_eth.spool import Spool
 from smcrypto import sm2
 
 PASSWORD = b"robot's"

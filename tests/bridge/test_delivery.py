@@ -207,6 +207,11 @@ def lines_of(chunk: Chunk) -> list[bytes]:
     return [line for line in open_lines(PLACE, chunk, key) if line != STREAM_LINE]
 
 
+def copy_folder(source: Path, target: Path) -> None:
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+
+
 def told(caplog: pytest.LogCaptureFixture, who: str) -> str:
     """The warnings of one end."""
     return "\n".join(entry.getMessage() for entry in caplog.records
@@ -520,11 +525,11 @@ def test_a_disk_that_is_put_back_from_an_old_copy_is_told_on_both_ends_and_nothi
     world = World(tmp_path, 4, Faults())
     robot, copy = world.robot, tmp_path / "old"
     robot.capture(5)
-    robot.restart(disk=lambda: shutil.copytree(robot.folder, copy) and None)
+    robot.restart(disk=partial(copy_folder, robot.folder, copy))
     robot.capture(5)
     assert world.run(60)
     stored = world.stored()
-    robot.restart(disk=lambda: (robot.lose_disk(), shutil.copytree(copy, robot.folder, dirs_exist_ok=True)) and None)
+    robot.restart(disk=partial(copy_folder, copy, robot.folder))
     robot.capture(5)
     world.confirm()
     assert world.run(30, until=lambda: world.sender.held == FORKED and bool(world.reception.forked))

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 from eth_hash.auto import keccak
+from rosbridge_eth.inbox import RobotState
+from rosbridge_eth.inbox.sqlite import SqliteInbox
 
 from bridge.machine import PATIENCE, Machine, Running
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Disconnected, End, Server, ServerConfig, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
-from rosbridge_eth.inbox import RobotState
-from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.server.reception import Reception, Worker
 

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
+from rosbridge_eth.spool import Spool
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
@@ -22,11 +24,9 @@ from rosbridge_eth.errors import NetworkError, SourceError, StoreError
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.log.database import DiskFull
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
 from rosbridge_eth.robot.loop import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
-from rosbridge_eth.spool import Spool
 
 TOPIC = "/robot_1/odom"
 PLACE = Log(bytes(32), robot_id("robot_1"))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.inbox import Outcome
 
 from bridge.home.world import READER_PASSPHRASE, TK, World
 from rosbridge_eth.capture import stream_line
@@ -19,7 +20,6 @@ from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import Identity, Role, Trust, load_identity
-from rosbridge_eth.inbox import Outcome
 from rosbridge_eth.log.chunk import Chunk, Log
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.operator.bundle import join, read_bundle

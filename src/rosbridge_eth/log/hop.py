@@ -1,7 +1,7 @@
 """What a robot and its server say to each other inside the channel.
 
-    up    a chunk     00 | chunk, or 01 | after 32 | chunk
-    down  the state   head 24 | digest 32 | confirmed 24 | block 8 | again 1 | refused 32 | why, UTF-8, at most 400 bytes
+    up    a chunk    00 | chunk, or 01 | after 32 | chunk
+    down  a state    head 24 | digest 32 | confirmed 24 | block 8 | again 1 | refused 32 | why, UTF-8, at most 400 bytes
 
 The server says how far its replica of the robot's log goes, the robot sends what follows. A chunk follows the one that
 its header names as `previous`; where the robot has that one no more, `after` is the digest of the one behind which it
@@ -58,13 +58,13 @@ class ServerState(NamedTuple):
     def decode(data: bytes) -> ServerState:
         """HopError unless `data` is a state."""
         try:
+            head, digest, confirmed, block, again, refused = _STATE.unpack_from(data)
             why = data[_STATE.size :].decode("utf-8")
-            state = ServerState(*_STATE.unpack_from(data), why)
         except (struct.error, UnicodeDecodeError):
             raise HopError(f"not a server's state: {len(data)} bytes") from None
         if len(data) > _STATE.size + MAX_WHY or not why.isprintable():
             raise HopError("a reason that is too long or does not print")
-        return state
+        return ServerState(head, digest, confirmed, block, again, refused, why)
 
 
 def encode_offer(chunk: bytes, after: bytes = b"") -> bytes:

@@ -29,7 +29,8 @@ from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.config.values import Address, counted, parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
-from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
+from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
@@ -75,8 +76,6 @@ class Robot:
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
-        self.dropped_before = spool.statistics().dropped_bodies
-        """Of the bodies that the full spool gave up, those before this start."""
         self._marks: deque[tuple[bytes, Counter[str]]] = deque()  # place, and records sealed up to there
         self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
@@ -320,7 +319,7 @@ class Robot:
                 len(self._ring) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
             f"chunks dropped, since the {'disk was full' if self.spool.disk_was_full else 'spool was at its max_size'}":
-                spool.dropped_bodies - self.dropped_before,
+                spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]
@@ -402,16 +401,20 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     key = identity.signing_key
     spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
     now = time.monotonic()
+    # A robot that begins in 1970, its disk lost, begins its log behind what was written under its name before.
+    known = max(certificate_clock(home)(), identity.public.not_before)
+    since = int(known.timestamp() * 1000 - 1).to_bytes(8, "big") + bytes(STREAM_SIZE - 8)
     first_line = stream_line(source.kind, f"rosbridge_eth {__version__}")
     writer = LogWriter(
-        place, key, readers, previous=spool.last_digest, stream_line=first_line,
-        period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress, now=now,
+        place, key, readers, previous=spool.last_digest, newest=max(spool.newest[:STREAM_SIZE], since),
+        stream_line=first_line, period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress,
+        now=now,
     )
     client = Client(
         ClientConfig(mode=Mode[config.channel.upper()]), identity, Trust(roots), end.server_name, now,
         wall=certificate_clock(home),
     )
-    sender = Sender(client, spool, channel=config.channel, on_server_time=partial(keep_time, home))
+    sender = Sender(client, spool, writer, channel=config.channel, on_server_time=partial(keep_time, home))
     return Robot(
         source=source, capture=capture, writer=writer, spool=spool, client=client,
         server=config.server or parse_address(end.server_address), sender=sender, box=box,

@@ -15,7 +15,15 @@ import logging
 from collections.abc import Callable
 
 from rosbridge_eth.channel import (
-    Client, Connected, Disconnected, End, Event, HandshakeFailed, Message, Reason, Unresolved,
+    Client,
+    Connected,
+    Disconnected,
+    End,
+    Event,
+    HandshakeFailed,
+    Message,
+    Reason,
+    Unresolved,
 )  # fmt: skip
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk
 from rosbridge_eth.log.hop import FORKED, HopError, ServerState, encode_offer
@@ -88,6 +96,11 @@ class Sender:
         """The server has all that is on the disk."""
         state = self.state
         return state is not None and not self.held and not self._spool.rows(state.head, 1)
+
+    @property
+    def forked(self) -> bool:
+        """Whether another machine, or an older life of this one, has written into this robot's log."""
+        return self.held == FORKED or self.refusal == TWICE
 
     # What comes
 
@@ -176,8 +189,8 @@ class Sender:
         if state.refused != NO_DIGEST and (place := self._spool.set_aside(state.refused)):
             self.refused += 1
             log.error(
-                "the server refuses chunk %d of stream %s, since its signature or its body is wrong; it is set aside and"
-                " a new stream begins", int.from_bytes(place[STREAM_SIZE:], "big"), place[:STREAM_SIZE].hex(),
+                "the server refuses chunk %d of stream %s, since its signature or its body is wrong; it is set aside"
+                " and a new stream begins", int.from_bytes(place[STREAM_SIZE:], "big"), place[:STREAM_SIZE].hex(),
             )  # fmt: skip
             if place[:STREAM_SIZE] == self._writer.stream:
                 self._writer.new_stream()

@@ -63,7 +63,7 @@ class Session:
     offers: list[Offer] = field(default_factory=list)
     why: str = ""
     until: float = 0.0
-    state: State = State()
+    state: State = field(default_factory=State)
     again: int = 0
     refused: bytes = NO_DIGEST
     said: bytes = b""

@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.inbox import open_inbox
 
 from bridge.home.world import NOW, PASSPHRASE, READER_PASSPHRASE, TK, World
 from rosbridge_eth import identity as ids
@@ -22,7 +23,6 @@ from rosbridge_eth.config import Address, load_reader_config, load_server_config
 from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
-from rosbridge_eth.inbox import open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable

@@ -7,8 +7,6 @@ import contextlib
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-
-from rosbridge_eth.log.chunk import MAX_CHUNK
 from rosbridge_eth.protocol import (
     MAX_WHY,
     Confirmed,
@@ -22,6 +20,8 @@ from rosbridge_eth.protocol import (
     decode_up,
     encode,
 )
+
+from rosbridge_eth.log.chunk import MAX_CHUNK
 
 streams, digests = st.binary(min_size=16, max_size=16), st.binary(min_size=32, max_size=32)
 numbers = st.integers(0, 2**64 - 1)

@@ -10,12 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.inbox import Inbox
 
 from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
-from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.operator import enrolment as admin

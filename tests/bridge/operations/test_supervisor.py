@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rosbridge_eth.spool import Spool
 
 import rosbridge_eth
 from bridge.operations.conftest import Place
@@ -34,7 +35,6 @@ from rosbridge_eth.server.supervisor import (
     notify,
     worker_name,
 )
-from rosbridge_eth.spool import Spool
 
 Pause = Callable[[str, int | None, float], float]
 

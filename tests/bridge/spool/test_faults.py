@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rosbridge_eth.spool import Spool
 
 from bridge import disks
 from bridge.chunks import STREAM, chain, chunk, dropped
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk, Log
 from rosbridge_eth.log.database import DiskFull
-from rosbridge_eth.spool import Spool
 
 LOG = Log(b"l" * 32, b"r" * 32)
 PLENTY = 1 << 30

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from rosbridge_eth.spool import Spool
 
 from bridge.chunks import STREAM, chain, chunk, dropped
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk, Log
 from rosbridge_eth.log.database import InUse, NothingThere
-from rosbridge_eth.spool import Spool
 
 LOG = Log(b"l" * 32, b"r" * 32)
 OTHER = b"o" * 16
