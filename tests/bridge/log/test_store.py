@@ -184,7 +184,8 @@ def test_a_robot_that_fills_its_share_blocks_no_other_and_none_of_its_later_chun
     small = chunk(5, size=0, previous=made[4].header.digest)
     assert len(small.encoded) < SIZE - 1
     batch = [*(Offer(A, one) for one in made), Offer(B, made[0]), Offer(A, small, made[3].header.digest)]
-    assert store.append([*batch, Offer(A, made[1]), Offer(B, made[1])], T0) == [STORED] * 4 + [FULL, STORED, FULL, KNOWN, STORED]
+    batch += Offer(A, made[1]), Offer(B, made[1])
+    assert store.append(batch, T0) == [STORED] * 4 + [FULL, STORED, FULL, KNOWN, STORED]
     assert head_is(store, made[3])
     assert put(store, [made[4]]) == [FULL]
     store.remove(A, [rows(store)[0].place])
