@@ -35,9 +35,6 @@ from pathlib import Path
 from typing import Any
 
 from eth_hash.auto import keccak
-from rosbridge_eth.log.sqlite import SqliteStore
-from rosbridge_eth.log.store import Store
-from rosbridge_eth.robot.spool import Spool
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
@@ -47,11 +44,14 @@ from rosbridge_eth.config import Address
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.sqlite import SqliteStore
+from rosbridge_eth.log.store import Store
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.loop import TAKE, Robot
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server.reception import Reception, Worker
 
 TOPIC = "/robot_1/odom"

@@ -49,8 +49,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from rosbridge_eth.robot.spool import Spool
-
 import geth_network
 from ports import free_port
 from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
@@ -81,6 +79,7 @@ from rosbridge_eth.reading import Verifier
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
 from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter

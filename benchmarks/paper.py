@@ -45,6 +45,7 @@ import load
 import paper_page
 import scale
 from rosbridge_eth.log.chunk import Chunk, robot_id
+from rosbridge_eth.log.store import Offer
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.server.submitter import Submitter
 from rosbridge_eth.server.supervisor import open_store, open_submitter

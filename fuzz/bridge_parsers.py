@@ -16,10 +16,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from rosbridge_eth.log.hop import HopError, ServerState, decode_offer, encode_offer
-
 from rosbridge_eth.log import chunk as chunks
 from rosbridge_eth.log.chunk import Chunk, ChunkError, Header
+from rosbridge_eth.log.hop import HopError, ServerState, decode_offer, encode_offer
 from smcrypto import sm2
 
 _LOG = chunks.Log(b"l" * 32, b"t" * 32)

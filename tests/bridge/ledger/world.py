@@ -12,7 +12,7 @@ from bridge.ledger.model_chain import ModelChain
 from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
 from rosbridge_eth.log.sqlite import SqliteStore
-from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, State, place_of
+from rosbridge_eth.log.store import NO_DIGEST, NOWHERE, Offer, Outcome, State, place_of
 from rosbridge_eth.server.submitter import Settings, Submitter
 from smcrypto import sm2
 
@@ -61,14 +61,18 @@ class Pen:
     def chunks(self, count: int, size: int = 0) -> list[Chunk]:
         return [self.chunk(size) for _ in range(count)]
 
-    def offers(self, chunks: Sequence[Chunk]) -> list[Offer]:
-        here = {chunk.header.digest for chunk in self.disk}
-        return [Offer(self.tk, chunk, chunk.header.previous not in here) for chunk in chunks]
+    def offers(self, chunks: Sequence[Chunk], front: bytes = NO_DIGEST) -> list[Offer]:
+        """front: the digest of the store's head. What is not on the disk any more is no reason to wait."""
+        here, offers = {chunk.header.digest for chunk in self.disk}, list[Offer]()
+        for chunk in chunks:
+            offers.append(Offer(self.tk, chunk, b"" if chunk.header.previous in here else front))
+            front = chunk.header.digest
+        return offers
 
     def told(self, state: State) -> list[Offer]:
         """What it sends when the server says this: what follows the head."""
         self.disk = [chunk for chunk in self.disk if place_of(chunk.header) > state.confirmed]
-        return self.offers([chunk for chunk in self.disk if place_of(chunk.header) > state.head])
+        return self.offers([chunk for chunk in self.disk if place_of(chunk.header) > state.head], state.digest)
 
 
 def copy_file(source: Path, target: Path) -> Path:
@@ -143,7 +147,8 @@ class World:
         return self.submitter
 
     def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> list[Outcome]:
-        return self.store.append((pen or self.pen).offers(chunks), self.now)
+        pen = pen or self.pen
+        return self.store.append(pen.offers(chunks, self.state(pen).digest), self.now)
 
     def talk(self, pen: Pen | None = None) -> list[Outcome]:
         """The robot is told the state, and sends what follows; not before the chain was asked."""

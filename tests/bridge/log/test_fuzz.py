@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from rosbridge_eth.log.hop import ServerState, encode_offer
 
 from bridge.log.making import sealed
 from rosbridge_eth.log.chunk import zstd
+from rosbridge_eth.log.hop import ServerState, encode_offer
 
 PATH = Path(__file__).resolve().parents[3] / "fuzz" / "bridge_parsers.py"
 _SPEC = importlib.util.spec_from_file_location("bridge_parsers", PATH)
