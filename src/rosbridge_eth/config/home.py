@@ -201,7 +201,6 @@ class OperatorHome:
         self.registry = path / "registry.sqlite"
         self.deployment_file = path / "deployment.json"
         self.reader_config = path / "reader.toml"
-        self.inbox = path / "inbox.sqlite"
         self.bundles = path / "bundles"
 
     @property

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rosbridge_eth.spool import Spool
 
 import rosbridge_eth
 from bridge.operations.conftest import Place
@@ -23,6 +22,7 @@ from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.errors import ExitCode, NetworkError, ProcessError, StoreError
 from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import metrics, supervisor
 from rosbridge_eth.server.supervisor import (
     GIVE_UP_AFTER,
