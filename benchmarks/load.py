@@ -77,10 +77,10 @@ from rosbridge_eth.reading import Verifier
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
 from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
-from rosbridge_eth.spool import Spool
 from smcrypto import sm2
 
 TOPIC = "/robot_1/odom"
@@ -405,17 +405,18 @@ class Session:
         self._chunks: list[Chunk] = []
 
     def seal(self, messages: int, per_chunk: int) -> dict[bytes, bytes]:
-        writer = LogWriter(
+        self._writer = LogWriter(
             self._place, self.robot.signing_key, [self._operator.reader.encryption_certificate.public_key],
-            previous=self.spool.last_digest, stream_line=stream_line("bag", "load"), now=0.0,
+            previous=self.spool.last_digest, newest=self.spool.newest[:16], stream_line=stream_line("bag", "load"),
+            now=0.0,
         )
-        self._chunks = list(seal_all(writer, messages, per_chunk))
+        self._chunks = list(seal_all(self._writer, messages, per_chunk))
         return {chunk.header.digest: chunk.encoded for chunk in self._chunks}
 
     def connect(self) -> None:
         now = time.monotonic()
         self.client = Client(ClientConfig(), self.robot, self._operator.trust, "server", now)
-        self.sender = Sender(self.client, self.spool)
+        self.sender = Sender(self.client, self.spool, self._writer)
         self.sock, address = client_socket(self._server)
         self.client.connect(address, now)
 
@@ -437,14 +438,14 @@ class Session:
         client.handle_timer(now)
         while (event := client.next_event()) is not None:
             self.sender.handle(event, now)
-        self.sender.send()
+        self.sender.send(now)
         for data, place in client.datagrams_to_send(now):
             self.sock.sendto(data, place)
         return client.next_timer() or now + 1
 
     @property
     def connected(self) -> bool:
-        return self.sender.statistics.connected
+        return self.sender.connected
 
     @property
     def stored(self) -> bool:
@@ -486,9 +487,9 @@ def client_process(
     report.send(sum(session.spool.statistics().unstored for session in sessions))
     drive(sessions, lambda session: session.confirmed, limit)
     report.send({
-        "sent": sum(session.sender.statistics.sent for session in sessions),
-        "refused": sum(session.sender.statistics.refused for session in sessions),
-        "reconnected": sum(session.sender.statistics.sessions - 1 for session in sessions),
+        "sent": sum(session.sender.sent for session in sessions),
+        "refused": sum(session.sender.refused for session in sessions),
+        "reconnected": sum(session.sender.sessions - 1 for session in sessions),
         "retransmitted": sum(session.client.statistics()["retransmitted"] for session in sessions),
     })  # fmt: skip
     report.recv()

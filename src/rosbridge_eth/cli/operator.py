@@ -28,8 +28,8 @@ from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
 if TYPE_CHECKING:
-    from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Keyring, Ledger
+    from rosbridge_eth.log.store import Store
 
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
@@ -76,7 +76,7 @@ def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring
     return place, passphrase, Keyring.load(place.accounts, passphrase)
 
 
-def _inbox(place: OperatorHome, robot: str) -> Inbox:
+def _inbox(place: OperatorHome, robot: str) -> Store:
     """The store of the shard to which this robot belongs."""
     from rosbridge_eth.server.shard import open_store
 

@@ -451,7 +451,7 @@ class StoreConfig(Section):
 
     url: `"sqlite"`, a file for each shard in the server's folder, or the URL of a Redis, which all shards share.
 
-    max_size: Bytes that a shard keeps, dead letters included; of a Redis, that all of them keep.
+    max_size: Bytes that a shard keeps in its file, dead letters included; a Redis has its own `maxmemory`.
 
     share: Bytes of one robot. Above it, that robot waits, and no other.
     """

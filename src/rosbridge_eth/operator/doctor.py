@@ -37,8 +37,8 @@ from rosbridge_eth.operator.status import ANSWER_TIME, span
 from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.robot.sender import mend
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.robot.topics import offered
-from rosbridge_eth.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
@@ -284,9 +284,9 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
         return
     config, waits, found = load_server_config(home.config), 0, "there is none yet; the server makes it"
     for shard in range(config.shards):
-        with suppress(NothingThere), closing(open_store(config, home, shard, read_only=True)) as inbox:
-            inbox.check()
-            waits += sum(held.chunks for tk, held in inbox.totals().items() if shard_of(tk, config.shards) == shard)
+        with suppress(NothingThere), closing(open_store(config, home, shard, read_only=True)) as opened:
+            opened.check()
+            waits += sum(opened.waiting(tk).chunks for tk in opened.sizes() if shard_of(tk, config.shards) == shard)
             found = f"{waits} chunks wait"
     yield ok("store", found)
 

@@ -23,8 +23,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from rosbridge_eth.channel import Drop
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.log.store import Store
 
 if TYPE_CHECKING:
     from rosbridge_eth.operator.registry import Enrolment
@@ -59,6 +59,11 @@ NEWEST = _gauge(
     "newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "process", "robot"
 )
 SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
+FORKED = _gauge(
+    "forked_seconds",
+    "When its log was last seen to go on in two places, or two machines to have its identity, seconds since 1970.",
+    "robot",
+)
 WAITING = _gauge("waiting_chunks", "Chunks in the store that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
 OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
@@ -206,21 +211,22 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time
             SESSION.labels(session.peer.name, address[0]).set(wall)
+    for robot, at in reception.forked.items():
+        FORKED.labels(robot).set(wall - time.monotonic() + at)
     CONDITION.labels(process, "stores chunks").set(reception.trouble.why is None)
 
 
 def show_submitter(
-    process: str, submitter: Submitter, inbox: Inbox, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+    process: str, submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
 ) -> None:
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     BEAT.labels(f"{process} submitter").set(wall)
-    states = inbox.states([*robots])
-    for tk, robot in robots.items():
-        name, held = robot.name, inbox.waiting(tk, states[tk].position)
+    for (tk, robot), state in zip(robots.items(), store.states([*robots]), strict=True):
+        name, held = robot.name, store.waiting(tk)
         WAITING.labels(name).set(held.chunks)
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
-        HELD.labels(name).set(states[tk].hold is not None and (held.chunks > 0 or robot.revoked_at is None))
+        HELD.labels(name).set(bool(state.hold) and (held.chunks > 0 or robot.revoked_at is None))
         GAS.labels(name).set(submitter.gas[tk])
         if standing := submitter.standings.get(tk):
             ON_CHAIN.labels(name).set(standing.chunks)
@@ -259,9 +265,11 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
         SPOOL_CHUNKS.labels(name, state).set(chunks)
     SPOOL_BYTES.labels(name).set(spool.bytes)
     SPOOL_DROPPED.labels(name).set(spool.dropped_bodies)
-    CONNECTED.labels(name).set(robot.sender.statistics.connected)
+    CONNECTED.labels(name).set(robot.sender.connected)
+    if robot.sender.forked:
+        FORKED.labels(name).set(wall)
     for condition, holds in {
-        "robot has a session": robot.sender.statistics.connected, "server's name has an address": robot.loop.resolved,
+        "robot has a session": robot.sender.connected, "server's name has an address": robot.loop.resolved,
         "spool takes chunks": robot.spool_trouble.why is None,
     }.items():
         CONDITION.labels("robot", condition).set(holds)

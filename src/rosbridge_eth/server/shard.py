@@ -22,9 +22,10 @@ from rosbridge_eth.config import ServerConfig as Settings
 from rosbridge_eth.config.home import OperatorHome, shard_of
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import Identity
-from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.log import opening
+from rosbridge_eth.log.store import Store
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.operator.enrolment import server_trust
 from rosbridge_eth.operator.registry import Enrolment, Registry
@@ -54,9 +55,9 @@ def name_of(shard: int) -> str:
     return f"shard-{shard}"
 
 
-def open_store(config: Settings, home: OperatorHome, shard: int = 0, *, read_only: bool = False) -> Inbox:
+def open_store(config: Settings, home: OperatorHome, shard: int = 0, *, read_only: bool = False) -> Store:
     """The store of a shard: a file of its own, or the Redis of all. Raises StoreError."""
-    return open_inbox(
+    return opening.open_store(
         config.store.url, file=home.store(shard), ledger=home.deployment().ledger, max_bytes=config.store.max_size,
         max_bytes_per_robot=config.store.share, read_only=read_only,
     )
@@ -68,16 +69,16 @@ def robots_of(shard: int, config: Settings, registry: Registry) -> dict[bytes, E
 
 
 def open_reception(
-    config: Settings, identity: Identity, home: OperatorHome, registry: Registry, inbox: Inbox, shard: int = 0,
+    config: Settings, identity: Identity, home: OperatorHome, registry: Registry, store: Store, shard: int = 0,
 ) -> Reception:  # fmt: skip
     """What answers the robots of a shard."""
     channel = ServerConfig(modes=tuple(Mode[mode.upper()] for mode in config.channel))
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
-    return Reception(server, inbox, home.deployment().ledger, registry.in_force)
+    return Reception(server, store, home.deployment().ledger, registry.in_force)
 
 
 def open_submitter(
-    config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring, shard: int = 0
+    config: Settings, ledger: Ledger, store: Store, registry: Registry, keys: Keyring, shard: int = 0
 ) -> Submitter:
     """The submitter of a shard. The first one alone pays: two would send with the same nonces of one account."""
 
@@ -86,12 +87,13 @@ def open_submitter(
         return None if found is None else keys.robot(found.number)
 
     return Submitter(
-        ledger, inbox, lambda: robots_of(shard, config, registry), account, keys.operator if shard == 0 else None,
+        ledger, store, lambda: robots_of(shard, config, registry), account, keys.operator if shard == 0 else None,
         SubmitterSettings(
             confirmations=config.chain.confirmations, max_fee=int(config.chain.max_fee_gwei * 10**9),
             low_water=int(config.funds.below * WEI_PER_ETH), top_up=int(config.funds.by * WEI_PER_ETH),
             gas_per_day=config.funds.gas_per_day,
         ),
+        lambda: registry.in_force().keys() - robots_of(shard, config, registry).keys(),
     )  # fmt: skip
 
 

@@ -24,10 +24,10 @@ from rosbridge_eth.config import Address
 from rosbridge_eth.config.home import shard_of
 from rosbridge_eth.errors import ConfigError, ExitCode, NetworkError, StoreError
 from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import metrics, parent
 from rosbridge_eth.server.parent import FIRST_PAUSE, LONG_LIFE, LONGEST_PAUSE, Child, Parent, notify
 from rosbridge_eth.server.shard import Shard, submit
-from rosbridge_eth.spool import Spool
 
 SECRETS: Any = None
 
