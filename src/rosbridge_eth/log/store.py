@@ -4,9 +4,9 @@ A chunk's *place* is stream | number, 24 bytes; places order as the log does, si
 at which it was begun. A robot is named by its Tk. Its *head* is the place up to which its log was taken, and stays
 where it is when rows are removed.
 
-The rule: a chunk is taken if it follows the head (its `previous` is the digest there), or if the robot says that it is
-the oldest it still has. So whoever sends is told the head, and sends what follows it; a replica that was lost, or put
-back from an old copy, says a lower head and is sent the rest.
+The rule: a chunk is taken if it follows the head: its `previous` is the digest there, or the robot says that it has
+nothing else behind that digest. So whoever sends is told the head, and sends what follows it; a replica that was lost,
+or put back from an old copy, says a lower head and is sent the rest.
 
 Rows up to the confirmed place are on the chain, and kept for some time, since the chain may still turn back. Every
 write is named by its place, so that one that is carried out twice changes nothing. `now` is seconds since 1970.
@@ -41,11 +41,15 @@ class Outcome(Enum):
 
 
 class Offer(NamedTuple):
-    """A chunk of the robot `tk`. oldest: the robot says that it has nothing between the head and this chunk."""
+    """A chunk of the robot `tk`.
+
+    after: the digest behind which the robot has nothing else than this chunk, where that is not the chunk's `previous`:
+    what stood between them it gave up, or never had.
+    """
 
     tk: bytes
     chunk: Chunk
-    oldest: bool = False
+    after: bytes = b""
 
 
 class State(NamedTuple):
@@ -122,10 +126,10 @@ class Store(Protocol):
 
         1. another header at its place, as a row or the head: DIFFERENT
         2. not above the head: KNOWN; but DIFFERENT between rows, or between the rows and the head
-        3. above the head and does not follow it:
+        3. above the head, and its `previous` is not the digest there:
            a. the log went on otherwise here, which no honest robot's does: its place is the one after the head's in the
               same stream, or the chunk that it names is a row and not the newest below its place: DIFFERENT
-           b. not the oldest: NOT_NEXT
+           b. NOT_NEXT, unless the offer's `after` is the digest of the head
         4. a row already, as there are above a head that `follow` has lowered: KNOWN, and the head is there
         5. beyond the robot's share or the whole bound: FULL, and so is any later one of the robot
         6. else STORED, and the head is there

@@ -336,7 +336,7 @@ def readers(home: RobotHome, secret: bytes | None) -> Findings:
 def source(home: RobotHome, secret: bytes | None) -> Findings:
     config = load_robot_config(home.config)
     settings, why = config.source_and_why(os.environ)
-    with closing(sources.open_source(settings, config.selection())) as opened:
+    with closing(sources.open_source(settings, sources.Selection.of(config))) as opened:
         offers = offered(opened)
     if settings.kind == "sim":
         yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")

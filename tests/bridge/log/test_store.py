@@ -48,7 +48,8 @@ def store(backend) -> Iterator[Store]:
 
 
 def put(store: Store, chunks, tk: bytes = A, now: float = T0, *, oldest: bool = False) -> list[Outcome]:
-    return store.append([Offer(tk, one, oldest) for one in chunks], now)
+    """oldest: the robot says that it has nothing between the head and each of the chunks."""
+    return store.append([Offer(tk, one, state(store, tk).digest if oldest else b"") for one in chunks], now)
 
 
 def rows(store: Store, tk: bytes = A) -> list[Row]:
@@ -110,6 +111,7 @@ def test_what_does_not_follow_the_head_is_not_taken_unless_it_is_the_oldest(stor
     assert put(store, [made[3]], oldest=True) == [STORED]
     assert put(store, [made[4], made[2]]) == [STORED, DIFFERENT]
     assert held(store) == [made[0], made[3], made[4]]
+    assert store.append([Offer(A, chunk(0, LATE), made[3].header.digest)], T0) == [NOT_NEXT]  # said of another head
     later = list(chain(2, LATE))  # of a robot whose disk was lost: nothing stands before it
     assert put(store, later[:1]) == [NOT_NEXT]
     assert put(store, later[:1], oldest=True) + put(store, later[1:]) == [STORED, STORED]
@@ -181,8 +183,9 @@ def test_a_robot_that_fills_its_share_blocks_no_other_and_none_of_its_later_chun
     made = list(chain(5))
     small = chunk(5, size=0, previous=made[4].header.digest)
     assert len(small.encoded) < SIZE - 1
-    batch = [Offer(A, one) for one in made] + [Offer(B, made[0]), Offer(A, small, oldest=True), Offer(A, made[1])]
-    assert store.append([*batch, Offer(B, made[1])], T0) == [STORED] * 4 + [FULL, STORED, FULL, KNOWN, STORED]
+    batch = [*(Offer(A, one) for one in made), Offer(B, made[0]), Offer(A, small, made[3].header.digest)]
+    batch += Offer(A, made[1]), Offer(B, made[1])
+    assert store.append(batch, T0) == [STORED] * 4 + [FULL, STORED, FULL, KNOWN, STORED]
     assert head_is(store, made[3])
     assert put(store, [made[4]]) == [FULL]
     store.remove(A, [rows(store)[0].place])
@@ -458,7 +461,7 @@ class Model(RuleBasedStateMachine):
         return sum(len(one.encoded) for tk in tks for one in self.rows[tk].values())
 
     def _expect(self, offer: Offer, full: set[bytes]) -> Outcome:
-        tk, one, oldest = offer
+        tk, one, after = offer
         mine, known, here, size = self.rows[tk], self.states[tk], place(one), len(one.encoded)
         there = {mine[here].header.digest} if here in mine else set()
         there |= {known.digest} if here == known.head else set()
@@ -470,7 +473,7 @@ class Model(RuleBasedStateMachine):
             named = [at for at, row in mine.items() if row.header.digest == one.header.previous]
             if here == successor(known.head) or (named and any(named[0] < at < here for at in [*mine, known.head])):
                 return DIFFERENT
-            if not oldest and tk not in full:
+            if after != known.digest and tk not in full:
                 return NOT_NEXT
         if not there:
             whole = self._size(A, B) + size > self.WHOLE and self.backend.bounded
@@ -492,7 +495,7 @@ class Model(RuleBasedStateMachine):
                         variant=draw(st.integers(0, 1)), previous=previous)  # fmt: skip
             one = draw(pick([one, one, *self.made[-5:]]))
             self.made.append(one)
-            offers.append(Offer(tk, dropped(one) if draw(st.booleans()) else one, draw(st.booleans())))
+            offers.append(Offer(tk, dropped(one) if draw(st.booleans()) else one, draw(pick([b"", *heads]))))
         for offer in offers:
             expected.append(self._expect(offer, full))
         assert self.store.append(offers, T0) == expected
@@ -520,19 +523,14 @@ class Model(RuleBasedStateMachine):
     def confirm_and_forget(self, data: st.DataObject, tk: bytes, keep: int, old: bool) -> None:
         mine = self.rows[tk]
         confirmed = data.draw(st.sampled_from([NOWHERE, *mine]))
-        self.store.set_state(tk, confirmed=confirmed, block=len(mine))
+        block = len(mine)
+        self.store.set_state(tk, confirmed=confirmed, block=block)
         self.store.forget(tk, T0 + old, keep)
         base = self.states[tk].base
         for at in sorted(mine):
             if at < confirmed and (old or self._size(tk) > keep):
                 base = Web3.keccak(mine.pop(at).encoded)
-        self.states[tk] = self.states[tk]._replace(
-            confirmed=confirmed, block=data.draw(st.just(self._block(tk))), base=base
-        )
-
-    def _block(self, tk: bytes) -> int:
-        [found] = self.store.states([tk])
-        return found.block
+        self.states[tk] = self.states[tk]._replace(confirmed=confirmed, block=block, base=base)
 
     @rule()
     def another_process(self) -> None:

@@ -495,15 +495,15 @@ def test_a_redis_that_is_away_is_told_without_its_password(place: Place, capsys:
 # Homes, and what a person sees
 
 
-def test_what_is_nobodys_home_and_one_of_the_first_edition_are_refused(place: Place, capsys: Capture):
+def test_what_is_no_home_and_one_of_another_edition_are_refused(place: Place, capsys: Capture):
     Path("empty").mkdir()
     Path("old").mkdir()
-    Path("old/server.toml").write_text("listen = 1")
+    Path("old/home.json").write_text('{"format": "rosbridge-eth home 2", "kind": "operator"}')
     for command in ("doctor", "status"):
         assert run([command, "--home", "empty"]) == ExitCode.CONFIG
         assert "not a home" in capsys.readouterr().err
         assert run([command, "--home", "old"]) == ExitCode.CONFIG
-        assert "first edition" in capsys.readouterr().err
+        assert "another version" in capsys.readouterr().err
 
 
 def test_a_person_sees_a_table_and_every_mend(place: Place, capsys: Capture):
