@@ -61,14 +61,15 @@ class Pen:
     def chunks(self, count: int, size: int = 0) -> list[Chunk]:
         return [self.chunk(size) for _ in range(count)]
 
-    def offers(self, chunks: Sequence[Chunk]) -> list[Offer]:
-        here = {chunk.header.digest for chunk in self.disk}
-        return [Offer(self.tk, chunk, chunk.header.previous not in here) for chunk in chunks]
+    def offers(self, chunks: Sequence[Chunk], head: bytes) -> list[Offer]:
+        """These, behind the head with this digest."""
+        before = [head, *(chunk.header.digest for chunk in chunks)]
+        return [Offer(self.tk, *each) for each in zip(chunks, before, strict=False)]
 
     def told(self, state: State) -> list[Offer]:
         """What it sends when the server says this: what follows the head."""
         self.disk = [chunk for chunk in self.disk if place_of(chunk.header) > state.confirmed]
-        return self.offers([chunk for chunk in self.disk if place_of(chunk.header) > state.head])
+        return self.offers([chunk for chunk in self.disk if place_of(chunk.header) > state.head], state.digest)
 
 
 def copy_file(source: Path, target: Path) -> Path:
@@ -143,7 +144,7 @@ class World:
         return self.submitter
 
     def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> list[Outcome]:
-        return self.store.append((pen or self.pen).offers(chunks), self.now)
+        return self.store.append((pen or self.pen).offers(chunks, self.state(pen).digest), self.now)
 
     def talk(self, pen: Pen | None = None) -> list[Outcome]:
         """The robot is told the state, and sends what follows; not before the chain was asked."""
