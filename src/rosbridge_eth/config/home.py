@@ -14,7 +14,7 @@ An operator's home (made by `init`); it holds no reader's key and no robot's:
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
     reader.toml          the same for readers, to be put beside their keys
-    inbox.sqlite         the server's replica of the robots' logs
+    store.sqlite         the server's replica of the robots' logs
     bundles/             what `register` writes for robots
 
 A robot's home (made by `join`):
@@ -201,7 +201,6 @@ class OperatorHome:
         self.registry = path / "registry.sqlite"
         self.deployment_file = path / "deployment.json"
         self.reader_config = path / "reader.toml"
-        self.inbox = path / "inbox.sqlite"
         self.bundles = path / "bundles"
 
     @property

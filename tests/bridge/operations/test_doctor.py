@@ -29,6 +29,7 @@ from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.log import store
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.operator import doctor as checks
 from rosbridge_eth.operator import enrolment as admin
@@ -151,7 +152,7 @@ ODOM = 'topics = ["/robot_1/odom"]\n'
     ("operator", lambda p: (p / "operator/server.toml").write_text("listen = 1"), "configuration", ""),
     ("operator", lambda p: (p / "operator/registry.sqlite").write_bytes(b"no database" * 999), "registry", "backup"),
     ("operator", lambda p: (p / "pass").write_bytes(b"another"), "passphrase", ""),
-    ("operator", lambda p: (p / "operator/inbox.sqlite").write_bytes(b"no database" * 999), "store", ""),
+    ("operator", lambda p: (p / "operator/store.sqlite").write_bytes(b"no database" * 999), "store", ""),
     ("reader", lambda p: (p / "readers").write_bytes(b"another"), "keys", ""),
     ("reader", lambda p: (p / "reader/reader.toml").write_text("x = 1"), "node", ""),
 ])
@@ -454,7 +455,7 @@ def test_another_chain_with_the_same_id_has_its_mend(place: Place, keys: Keyring
 
 def test_what_waits_is_told(place: Place, capsys: Capture):
     inbox, tk = place.inbox(), robot_id("robot_1")
-    inbox.append([(tk, chunk) for chunk in chunk_chain(3)], time.time())
+    inbox.append([store.Offer(tk, chunk) for chunk in chunk_chain(3)], time.time())
     inbox.close()
     _, findings = doctor(capsys)
     assert of(findings, "store")["found"] == "3 chunks wait"
