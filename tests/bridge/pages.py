@@ -41,8 +41,8 @@ def script_of(page: str, marked: str = "") -> tuple[str, list[str]]:
 
 def type_page(
     page: str, folder: Path, *, ports: Mapping[str, int] | None = None, environment: Mapping[str, str] | None = None,
-    before: str = "", after: str = "", marked: str = "", python: str = sys.executable, shell: tuple[str, ...] = ("bash",),
-    typed: str = "",
+    before: str = "", after: str = "", marked: str = "", python: str = sys.executable,
+    shell: tuple[str, ...] = ("bash",), typed: str = "",
 ) -> str:  # fmt: skip
     """Run a page's commands and give what they printed.
 
