@@ -13,7 +13,7 @@ from rosbridge_eth.identity import PeerIdentity
 
 
 class Full(NetworkError):
-    """No more is taken until some of what was sent is acknowledged; ask `writable` first."""
+    """No more is taken until some of what was sent is acknowledged; ask `room` first."""
 
 
 class NotConnected(NetworkError):
@@ -32,6 +32,10 @@ class End(StrEnum):
     EXPIRED = "the session's time or packet numbers are used up"
 
 
+CLOSE_CODES = (End.CLOSED, End.PROTOCOL, End.REPLACED, End.REVOKED, End.EXPIRED, End.SILENT)
+"""The reasons of a CLOSE, by their number."""
+
+
 class Drop(StrEnum):
     """Why a datagram was dropped without a word; counted in an endpoint's `statistics`."""
 
@@ -40,8 +44,6 @@ class Drop(StrEnum):
     UNEXPECTED = "unexpected in this state"
     ADDRESS = "from another address"
     COOKIE = "cookie wrong or too old"
-    REPLAYED_HANDSHAKE = "handshake seen before"
-    SOURCE_LIMIT = "too many handshakes from the source"
     BUSY = "no time left for handshakes"
     HALF_OPEN = "too many half-open handshakes"
     CONNECTIONS = "too many connections"
@@ -65,7 +67,7 @@ class Connected(NamedTuple):
 
 
 class Disconnected(NamedTuple):
-    """The session ended. What it did not deliver is the program's to send again in the next one."""
+    """The session ended. Which messages arrived, the server's next state says."""
 
     reason: End
     connection: bytes
@@ -73,11 +75,17 @@ class Disconnected(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message of the peer's, in the order of its sending, once a session."""
+    """At a server: a message of a client's, in the order of its sending, each once a session."""
 
     connection: bytes
     payload: bytes
-    peer: PeerIdentity
+
+
+class State(NamedTuple):
+    """At a client: what the server's program says now, which takes the place of what it said before. The first of a
+    session follows Connected; later ones come when it has changed."""
+
+    data: bytes
 
 
 class HandshakeFailed(NamedTuple):
@@ -98,7 +106,7 @@ class Unresolved(NamedTuple):
     why: str
 
 
-Event = Connected | Disconnected | Message | HandshakeFailed | Unresolved
+Event = Connected | Disconnected | Message | State | HandshakeFailed | Unresolved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,9 +115,6 @@ class ClientConfig:
 
     mode: Mode = Mode.EXCHANGE
     """The one it uses; it never falls back to another."""
-    patience: float = 10.0
-    patience_max: float = 60.0
-    """A client that waits and gets no packet for so long makes a new session; doubled each time, up to the second."""
     attempt_timeout: float = 8.0
     """A handshake that takes longer is begun anew."""
 
@@ -120,17 +125,13 @@ class ServerConfig:
 
     modes: tuple[Mode, ...] = (Mode.EXCHANGE,)
     """Those it takes; `transport`, which is not forward secret, only where it is named here."""
-    worker: int = 0
-    """This process's number among those that share the port (0 to 255): first byte of its connection ids."""
     session_seconds: float = 3900.0
     """A session that its client did not end by this age is ended."""
     max_half_open: int = 1024
+    """Handshakes that wait for pieces of a PROOF, and as many that wait for the client's first packet."""
     max_connections: int = 4096
     max_early: int = 50_000
     """Segments of all sessions that came too early (60 MB). Above it each session keeps a few, and else takes only
     what comes in order."""
-    source_rate: float = 10.0
-    source_burst: float = 400.0
-    """Handshakes that one source may fail per second, and at once."""
     handshake_share: float = 0.5
     """Share of time that handshakes may take."""
