@@ -133,7 +133,7 @@ def rows(records: list[bytes], size: int, seconds: float) -> Iterator[tuple[str,
         yield (
             f"wraps for {readers}",
             cost(lambda i, n=readers: [reader.encrypt(key, encoding="c1c3c2") for reader in PUBLIC[:n]]),  # type: ignore[misc]
-            121 * readers / size,
+            113 * readers / size,
         )
     for level in LEVELS:
         sealed = [seal_to(group, 1, level).encoded for group in some]

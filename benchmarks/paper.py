@@ -10,6 +10,7 @@ in the JSON file, so that parts can be measured one by one; the page and the pic
     poa, pow     every client registers once, writes four times and asks four times, by number of clients
     bridge-poa   from `init` to a proven read, four robots as in the paper
     bridge-pow   the same by proof of work, and a reorganisation by two miners that were cut from each other
+    baseline     the same records into an ordinary replicated log with an anchor on the chain (baseline.py)
     scale        the model of scale.py, with the costs that are measured here
 
 --quick: few messages and clients, the load on anvil, and nothing by proof of work: what continuous integration runs.
@@ -36,6 +37,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import baseline
 import bridge_costs
 import chain_interaction
 import geth_network
@@ -268,6 +270,7 @@ def main() -> None:
         "bridge-poa": lambda: bridge("poa", quick, None),
         "pow": lambda: interaction("pow", quick, dag),
         "bridge-pow": lambda: bridge("pow", quick, dag),
+        "baseline": lambda: baseline.measure(quick),
         "scale": lambda: scale.measure(quick),
     }
     wanted = options.only if options.only is not None else [name for name in parts if not (quick and "pow" in name)]

@@ -9,8 +9,9 @@ that are not overloaded. Its assumptions are in `ASSUMED`, and stand on the page
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+import time
 from dataclasses import asdict, dataclass
+from math import ceil, inf
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,16 @@ import numpy
 import bridge_costs
 import load
 from rosbridge_eth.ledger.contract import set_data_gas
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server.supervisor import open_store, open_submitter
 
 RATES = (1, 10, 100)  # messages a second of each robot
 ROBOTS = (10, 30, 100, 300, 1000, 3000, 10_000, 30_000, 100_000)
 SESSION = 52.5 * 60  # seconds of a session, between 45 and 60 minutes
 DAY = 86_400
 BATCH = 96 * 1024  # bytes of chunks in a transaction, at most
-ANCHOR_EVERY = 60.0
-SET_ROOT_GAS = 53_500  # for any number of chunks of a robot; DESIGN section 3, not written yet
-HEADER = 192 + 64 + 121  # bytes of a chunk's header, signature and one grant: what is anchored without its body
+NODE_DISK = 3.7  # bytes on a node's disk for each byte of chunks: measured with geth and Clique
+REGISTERING_GAS = 146_733  # a robot, once: docs/ledger.md
 
 CHAINS: dict[str, float] = {
     "Clique as tested here": 30e6 / 1,
@@ -42,13 +44,14 @@ ASSUMED = (
     "Messages are the sample's Odometry, pose and twist; one reader; compressed as measured.",
     "A robot's chunks of one block go into one transaction of at most 96 KiB.",
     "Sessions last 52.5 minutes and are spread evenly; keep-alives cost nothing beside them.",
-    "A worker's processor time is per chunk and per record, a submitter's per chunk; both grow in a straight line.",
+    "A shard's processor time is per chunk and per record, its submitter's per chunk, and per registered robot and"
+    " second; all grow in a straight line. A submitter is one thread: a core at most. One shard more is one more.",
     "Gas of a chain in M a second, with nobody else on it: "
     + ", ".join(f"{name} {gas / 1e6:.1f}" for name, gas in CHAINS.items())
     + ". Ethereum: 60 M gas in 12 s; the rollup: 60 M gas in 2 s, a round figure.",
-    "Gas is that of the submitter's formula, which is above what the EVM takes by a tenth or so.",
-    f"Anchored: header and signature alone, {HEADER} bytes a chunk; or one `setRoot` a robot and minute,"
-    f" {SET_ROOT_GAS:,} gas. Neither is built.",
+    "Gas is that of the submitter's formula, which is above what the EVM takes by a tenth or so. Registering a robot"
+    f" takes {REGISTERING_GAS:,} once.",
+    f"A node's disk takes {NODE_DISK} times the bytes of the chunks.",
 )  # fmt: skip
 
 
@@ -60,6 +63,7 @@ class Costs:
     chunk_ms: float
     handshake_ms: float
     submitted_ms: float  # a chunk, in the submitter
+    quiet_ms: float  # a registered robot and look at the chain, in the submitter
     record_bytes: float
     chunk_bytes: float
     session_kib: float
@@ -67,17 +71,16 @@ class Costs:
 
 @dataclass(frozen=True)
 class Need:
-    """What some robots need."""
+    """What some robots need. shards: as many as their submitters need, each of which has one core."""
 
     robots: int
     rate: int
     cores: float
     submitter_cores: float
+    shards: int
     memory_gib: float
     bytes_a_day: float
     gas_a_second: float
-    anchored_gas_a_second: float
-    root_gas_a_second: float
 
 
 def need(costs: Costs, robots: int, rate: float, block: float) -> Need:
@@ -86,22 +89,26 @@ def need(costs: Costs, robots: int, rate: float, block: float) -> Need:
     chunks = rate / records  # a second, of each robot
     size = round(costs.chunk_bytes + records * costs.record_bytes)
     cores = robots * (rate * costs.record_ms + chunks * costs.chunk_ms + costs.handshake_ms / SESSION) / 1000
+    submitter = robots * (chunks * costs.submitted_ms + costs.quiet_ms) / 1000  # it looks once a second
     together = max(1, min(BATCH // size, round(chunks * block)))
     gas = set_data_gas([size] * together) / together * chunks
-    anchored = set_data_gas([HEADER] * together) / together * chunks
     return Need(
-        robots, int(rate), cores, robots * chunks * costs.submitted_ms / 1000, robots * costs.session_kib / 2**20,
-        robots * chunks * size * DAY, robots * gas, robots * anchored, robots * SET_ROOT_GAS / ANCHOR_EVERY,
+        robots, int(rate), cores, submitter, ceil(submitter), robots * costs.session_kib / 2**20,
+        robots * chunks * size * DAY, robots * gas,
     )  # fmt: skip
 
 
-def holds(costs: Costs, rate: float, gas_a_second: float, block: float, of: Callable[[Need], float]) -> int:
-    """The most robots that a chain holds."""
-    return int(gas_a_second / of(need(costs, 1, rate, block)))
+def most(costs: Costs, rate: float, block: float, gas_a_second: float = inf, submitter_cores: float = inf) -> int:
+    """The most robots that a chain holds, or so many submitters bear."""
+    one = need(costs, 1, rate, block)
+    return int(min(gas_a_second / one.gas_a_second, submitter_cores / one.submitter_cores))
 
 
 def calibrate(quick: bool) -> tuple[dict[str, float], list[tuple[float, float, float]]]:
-    """The costs of `Costs` that a run of `load.py` does not give, and the rows that they were fitted to."""
+    """The costs of `Costs` that a run of `load.py` does not give, and the rows that they were fitted to.
+
+    Nothing is cut off at zero: a cost a record below it says that the fit does not tell it from nothing.
+    """
     who, rows = bridge_costs.Identities(), []
     for per_chunk in (1, 10, 100):
         records = (5 if quick else 100) * per_chunk
@@ -112,7 +119,21 @@ def calibrate(quick: bool) -> tuple[dict[str, float], list[tuple[float, float, f
     inverse, server, sizes = (numpy.array(column) for column in zip(*rows, strict=True))
     _, record_ms = numpy.polyfit(inverse, server, 1)
     chunk_bytes, record_bytes = numpy.polyfit(inverse, sizes, 1)
-    return {"record_ms": max(0.0, record_ms), "record_bytes": record_bytes, "chunk_bytes": chunk_bytes}, rows
+    return {"record_ms": record_ms, "record_bytes": record_bytes, "chunk_bytes": chunk_bytes}, rows
+
+
+def quiet(operator: load.Operator, looks: int) -> float:
+    """Milliseconds of processor time that the submitter takes for a registered robot which says nothing, and a look."""
+    store, registry = open_store(operator.config, operator.home), Registry(operator.home.registry)
+    submitter = open_submitter(operator.config, operator.ledger, store, registry, operator.keys)
+    now = time.time()
+    submitter.turn(now)
+    started = time.process_time()
+    for look in range(1, looks + 1):
+        submitter.turn(now + 2.0 * look)
+    used = time.process_time() - started
+    store.close()
+    return used / looks / len(registry.robots()) * 1000
 
 
 def measure(quick: bool) -> dict[str, Any]:
@@ -125,6 +146,7 @@ def measure(quick: bool) -> dict[str, Any]:
         try:
             for count in counts:
                 runs.append(load.run(operator, count, messages, per_chunk=per_chunk, limit=1200.0))
+            quiet_ms = quiet(operator, 2 if quick else 20)
         finally:
             operator.close()
     first = runs[0]
@@ -132,25 +154,21 @@ def measure(quick: bool) -> dict[str, Any]:
     costs = Costs(
         **fitted, chunk_ms=(first.message_cpu_ms - fitted["record_ms"]) * first.sent / first.chunks,
         handshake_ms=first.handshake_cpu_ms, submitted_ms=first.submitter_cpu_ms * first.sent / first.chunks,
-        session_kib=first.growth_kib_per_session,
+        quiet_ms=quiet_ms, session_kib=first.growth_kib_per_session,
     )  # fmt: skip
     compared = []
     for run in runs:
         worked = run.sessions * costs.handshake_ms + run.sent * costs.record_ms + run.chunks * costs.chunk_ms
         compared.append({
             "sessions": run.sessions, "messages": run.sent, "chunks": run.chunks, "calibrating": run is first,
-            "workers_ms": run.established * run.handshake_cpu_ms + run.sent * run.message_cpu_ms, "model_ms": worked,
+            "shard_ms": run.established * run.handshake_cpu_ms + run.sent * run.message_cpu_ms, "model_ms": worked,
             "submitter_ms": run.sent * run.submitter_cpu_ms, "submitter_model_ms": run.chunks * costs.submitted_ms,
             "session_kib": run.growth_kib_per_session, "lost": run.lost, "doubled": run.doubled,
             "equal": run.equal, "load": run.load_average,
         })  # fmt: skip
     needs = [asdict(need(costs, robots, rate, 1.0)) for rate in RATES for robots in ROBOTS]
     limits = {
-        name: {str(rate): {
-            "whole": holds(costs, rate, gas, block, lambda need: need.gas_a_second),
-            "headers": holds(costs, rate, gas, block, lambda need: need.anchored_gas_a_second),
-            "roots": holds(costs, rate, gas, block, lambda need: need.root_gas_a_second),
-        } for rate in RATES}
+        name: {str(rate): most(costs, rate, block, gas_a_second=gas) for rate in RATES}
         for (name, gas), block in zip(CHAINS.items(), (1.0, 20.0, 12.0, 2.0), strict=True)
-    }  # fmt: skip
+    } | {"one shard's submitter": {str(rate): most(costs, rate, 1.0, submitter_cores=1.0) for rate in RATES}}
     return {"rows": rows, "costs": asdict(costs), "compared": compared, "needs": needs, "limits": limits}

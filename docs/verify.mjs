@@ -28,7 +28,7 @@ const ABI = [
 const SPAN = 2000 // blocks asked for at once
 const MAX = { body: 65536, readers: 16, records: 1000, plaintext: 4 << 20, line: 60 << 10, depth: 100, block: 128 << 10 }
 const FIXED = 1 + 1 + 16 + 8 + 32 + 8 + 4 + 32 + 4 + 32 + 1
-const GRANT = 8 + 113
+const GRANT = 113
 const ZEROS = '00'.repeat(32)
 
 const text = new TextEncoder()
@@ -83,7 +83,6 @@ function members(content) {
 
 const SM2_WITH_SM3 = '06082a811ccf55018375'
 const SM2_KEY = '301306072a8648ce3d020106082a811ccf5501822d'
-const [ROBOT, ANY] = ['2b06010505070302', '551d2500'] // clientAuth, anyExtendedKeyUsage
 const HARMLESS = new Set(['551d0e', '551d20', '551d23']) // identifiers of keys, and policies: any is taken
 const bits = (part) => part.content.slice(1)
 
@@ -101,7 +100,7 @@ function certificate(der) {
   })
   const found = {
     signed: signed.whole, signature: bits(signature), issuer: hex(issuer.whole), subject: hex(subject.whole),
-    key: hex(bits(point)), from, until, names: [], authority: false, usage: null, purposes: null, size: element(der, 0).end,
+    key: hex(bits(point)), from, until, names: [], authority: false, usage: null, size: element(der, 0).end,
   }
   const there = new Set()
   for (const { content } of rest.filter((part) => part.tag === 0xa3)) {
@@ -111,8 +110,7 @@ function certificate(der) {
       if (there.has(id)) throw new Wrong('untrusted', 'an extension is there twice')
       there.add(id)
       if (id === '551d13') found.authority = members(value.content).some((part) => part.tag === 1 && part.content[0])
-      else if (id === '551d0f') found.usage = bits(value)[0] // digitalSignature 80 … keyAgreement 08, keyCertSign 04
-      else if (id === '551d25') found.purposes = members(value.content).map((part) => hex(part.content))
+      else if (id === '551d0f') found.usage = bits(value)[0] // digitalSignature 80, nonRepudiation 40 … keyAgreement 08, keyCertSign 04
       else if (id === '551d11') {
         for (const name of members(value.content)) {
           found.names.push(`${name.tag & 0x1f}:${Buffer.from(name.content).toString('latin1')}`)
@@ -123,6 +121,7 @@ function certificate(der) {
     }
   }
   found.constrained = there.has('551d1e') // nameConstraints
+  found.purposes = there.has('551d25') // extendedKeyUsage
   return found
 }
 
@@ -145,15 +144,14 @@ function signer(certificates, roots, robot, blockTime) {
   const at = Math.max(blockTime * 1000, first.from, second.from)
   const until = Math.min(first.until, second.until)
   if (!(at <= until)) throw new Wrong('untrusted', 'had ended when they were registered')
-  for (const [made, own, others] of [[first, 0x80, 0x38], [second, 0x08, 0x80]]) {
+  for (const [made, own, others] of [[first, 0xc0, 0x38], [second, 0x08, 0xc0]]) {
     const issued = (root) => root.subject === made.issuer && root.authority && !root.constrained &&
       root.from <= at && at <= root.until && (root.usage === null || root.usage & 0x04) &&
-      (root.purposes === null || root.purposes.some((use) => [ROBOT, ANY].includes(use))) &&
       holds(root.key, made.signed, made.signature, true)
     if (!roots.some(issued)) throw new Wrong('untrusted', 'not signed by the CA')
     if (made.names.join() !== `6:urn:rosbridge-eth:robot:${robot}`) throw new Wrong('untrusted', `for ${made.names}`)
-    if (!(made.usage & own) || made.usage & others) throw new Wrong('untrusted', 'for another use')
-    if (!made.purposes?.includes(ROBOT) || made.authority) throw new Wrong('untrusted', 'for another purpose')
+    if ((made.usage & own) !== own || made.usage & others || made.purposes) throw new Wrong('untrusted', 'for another use')
+    if (made.authority) throw new Wrong('untrusted', 'a CA itself')
   }
   return { ...first, from: Math.max(first.from, second.from), until }
 }
@@ -171,13 +169,13 @@ function parse(data) {
     bodyLength: Number(number(take(4))), bodyDigest: hex(take(32)), grants: [],
   }
   const [count] = take(1)
-  for (let n = 0; n < count; n++) header.grants.push([hex(take(8)), take(113)])
+  for (let n = 0; n < count; n++) header.grants.push(take(GRANT))
   header.encoded = data.slice(0, at)
   header.digest = hex(digest(header.encoded))
   const signature = take(64)
   const body = data.slice(at)
   const empty = header.records === 0
-  const formed = version === 2 && flags <= 1 && signature.length === 64 && header.sealed < 253402300800000 &&
+  const formed = version === 3 && flags <= 1 && signature.length === 64 && header.sealed < 253402300800000 &&
     (body.length === 0 || body.length === header.bodyLength) && (empty
     ? header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
     : header.records <= MAX.records && count >= 1 && count <= MAX.readers && header.bodyLength > 16 &&
@@ -196,20 +194,25 @@ function root(leaves) {
   return hex(level[0])
 }
 
+// The first grant that decrypts. C1 | C3 | C2, GB/T 32918.4; the library wants C1 without its leading 04.
+function contentKey(grants, readerKey) {
+  for (const wrapped of grants) {
+    try {
+      const key = wrapped[0] === 4 && sm2.doDecrypt(hex(wrapped.slice(1)), readerKey, 1, { output: 'array' })
+      if (key.length === 16) return key
+    } catch {} // C1 is no point
+  }
+}
+const expanded = (key, label) => hmac(key, join(text.encode(`rosbridge-eth/3 ${label}`), [1])) // HKDF-Expand, RFC 5869
+
 function open({ header, body }, log, readerKey) {
   if (header.records === 0) return []
   const place = join(header.stream, bigEndian(header.number, 8))
-  const publicKey = getBytes('0x' + sm2.getPublicKeyFromPrivateKey(readerKey))
-  const tag = hex(digest(place, publicKey).slice(0, 8))
-  const grants = header.grants.filter(([name]) => name === tag)
-  if (!grants.length) throw new Wrong('no-grant')
-  // C1 | C3 | C2, GB/T 32918.4; the library wants C1 without its leading 04.
-  const keys = grants.map(([, wrapped]) => sm2.doDecrypt(hex(wrapped.slice(1)), readerKey, 1, { output: 'array' }))
-  const key = keys.find((one) => one.length === 16)
-  if (!key) throw new Wrong('unopenable', 'the wrapped key')
+  const key = contentKey(header.grants, readerKey)
+  if (!key) throw new Wrong('no-grant')
   let lines
   try {
-    const plaintext = sm4.decrypt(body.slice(0, -16), key, {
+    const plaintext = sm4.decrypt(body.slice(0, -16), expanded(key, 'body').slice(0, 16), {
       mode: 'gcm', iv: new Uint8Array(12), associatedData: join(log, place), tag: body.slice(-16), output: 'array',
     })
     const content = unpacked(plaintext)
@@ -220,7 +223,8 @@ function open({ header, body }, log, readerKey) {
     throw new Wrong('unopenable', error.message)
   }
   if (lines.length !== header.records) throw new Wrong('unopenable', 'another number of records')
-  const salt = (n) => hmac(key, bigEndian(n, 4)).slice(0, 16)
+  const saltKey = expanded(key, 'salts')
+  const salt = (n) => hmac(saltKey, bigEndian(n, 4)).slice(0, 16)
   const found = root(lines.map((line, n) => digest([0], salt(n), line)))
   if (found !== header.root) throw new Wrong('unopenable', 'another root')
   return lines

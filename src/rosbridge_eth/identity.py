@@ -35,8 +35,9 @@ _CA_LIFE, _LIFE = timedelta(days=3650), timedelta(days=825)
 _BACKDATED = timedelta(days=1)
 """Certificates begin so long before they are made, so that a chain or a robot whose clock is behind does no harm."""
 
-# GB/T 38636-2020, 6.4.5.3: a signing certificate signs, an encryption certificate takes keys.
-SIGNING_USAGE = ("digitalSignature",)
+# GB/T 38636-2020, 6.4.5.3: a signing certificate signs, an encryption certificate takes keys. What is signed here is
+# kept and shown to others (nonRepudiation, RFC 5280, 4.2.1.3); a TLS client's certificate is no log's signer.
+SIGNING_USAGE = ("digitalSignature", "nonRepudiation")
 ENCRYPTION_USAGE = ("keyEncipherment", "dataEncipherment", "keyAgreement")
 
 KEY_FILES = ("sign.key.pem", "enc.key.pem")
@@ -70,10 +71,6 @@ def check_name(name: str) -> str:
             f"the name {name!r} cannot be used: 1 to 63 of a-z, 0-9, '_', '.', '-', and first a letter or digit"
         )
     return name
-
-
-def _extended_key_usage(role: Role) -> str:
-    return "serverAuth" if role is Role.SERVER else "clientAuth"
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +173,20 @@ def _pair(signing: x509.Certificate, encryption: x509.Certificate) -> PeerIdenti
     return PeerIdentity(*holder, signing, encryption)
 
 
+def _check_usage(peer: PeerIdentity) -> None:
+    for certificate, usages, others in (
+        (peer.signing_certificate, SIGNING_USAGE, ENCRYPTION_USAGE),
+        (peer.encryption_certificate, ("keyAgreement",), SIGNING_USAGE),
+    ):
+        allowed = certificate.key_usage or ()
+        if certificate.extended_key_usage is not None or not {*usages} <= {*allowed} or {*others} & {*allowed}:
+            raise UntrustedCertificate(
+                f"the certificates of {peer} are for another use than signing and encrypting logs. Those of earlier"
+                " versions are made anew: of a robot by `register --replace` and `join`, of the server by `renew`, of"
+                " a reader by `reader` in a new folder"
+            )
+
+
 @dataclass(frozen=True, slots=True)
 class Trust:
     """Whom to believe: whom the operator's CA certified, and who is on the allow list.
@@ -206,23 +217,14 @@ class Trust:
             raise ExpiredCertificate(
                 f"the certificate of {peer} is valid from {peer.not_before} to {peer.not_after}, not at {at}"
             )
-        for certificate, use, other in (
-            (peer.signing_certificate, "digitalSignature", ENCRYPTION_USAGE),
-            (peer.encryption_certificate, "keyAgreement", SIGNING_USAGE),
-        ):
-            purpose = _extended_key_usage(peer.role)
+        _check_usage(peer)
+        for certificate in (peer.signing_certificate, peer.encryption_certificate):
             try:
-                path = x509.verify_chain(
-                    certificate, roots=self.roots, at=at, key_usage=(use,), extended_key_usage=purpose
-                )  # fmt: skip
+                path = x509.verify_chain(certificate, roots=self.roots, at=at)
             except CertificateError as error:
                 raise UntrustedCertificate(f"the certificate of {peer} is not to be trusted: {error}") from error
             if len(path) != 2 or certificate.is_ca:
                 raise UntrustedCertificate(f"the certificate of {peer} is a CA's, or was not issued by one")
-            if purpose not in (certificate.extended_key_usage or ()):
-                raise UntrustedCertificate(f"the certificate of {peer} does not say that it is for {purpose}")
-            if certificate.key_usage is None or set(other) & set(certificate.key_usage):
-                raise UntrustedCertificate(f"the certificates of {peer} do not keep signing and encryption apart")
         roles = (role,) if isinstance(role, Role) else tuple(role)
         if peer.role not in roles:
             raise UntrustedCertificate(f"{peer} was met where a {' or '.join(roles)} is expected")
@@ -289,8 +291,7 @@ def enrol_requests(
         if str(request.subject) != f"CN={check_name(name)}":
             raise IdentityError(f"the certificate request says {request.subject}, not CN={name}")
         certificates.append(x509.issue(
-            request, ca.certificate, ca.key, key_usage=usage, extended_key_usage=(_extended_key_usage(role),),
-            subject_alt_names=(f"{URI_PREFIX}{role}:{name}",),
+            request, ca.certificate, ca.key, key_usage=usage, subject_alt_names=(f"{URI_PREFIX}{role}:{name}",),
             not_before=max(at - _BACKDATED, ca.certificate.not_before),
             not_after=min(at + _LIFE, ca.certificate.not_after),
         ))  # fmt: skip
@@ -367,6 +368,7 @@ def identity_from_files(
             raise IdentityError(f"{name} cannot be opened: wrong password, or not a key file") from error
         if keys[-1].public_key != certificate.public_key:
             raise IdentityError(f"{name} is not the key of {name.replace('key', 'crt')}")
+    _check_usage(peer)
     identity = Identity(peer.role, peer.name, peer.signing_certificate, peer.encryption_certificate, *keys)
     return identity, read_certificates(files["ca.crt.pem"])
 

@@ -42,7 +42,10 @@ def test_nothing_is_lost_doubled_or_refused(written: Path) -> None:
 
 def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> None:
     page = (written / "evaluation.md").read_text()
-    for heading in ("User end", "Blockchain end", "Chain interaction", "The bridge on both networks", "Past this"):
+    for heading in (
+        "User end", "Blockchain end", "Chain interaction", "The bridge on both networks", "Beside an ordinary",
+        "Past this",
+    ):  # fmt: skip
         assert f"## {heading}" in page
     pictures = [line.partition("](")[2].rstrip(")") for line in page.splitlines() if line.startswith("![")]
     assert len(pictures) == 4
@@ -50,12 +53,13 @@ def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> No
 
 
 def test_the_model_needs_more_of_everything_for_more_robots() -> None:
-    costs = scale.Costs(0.01, 0.5, 4.0, 1.0, 70.0, 700.0, 100.0)
+    costs = scale.Costs(0.01, 0.5, 4.0, 1.0, 0.2, 70.0, 700.0, 100.0)
     for rate in scale.RATES:
         needs = [scale.need(costs, robots, rate, 1.0) for robots in scale.ROBOTS]
         for one, ten in zip(needs, needs[2:], strict=False):
             assert ten.gas_a_second == pytest.approx(ten.robots / one.robots * one.gas_a_second)
-            assert ten.anchored_gas_a_second < ten.gas_a_second
-            assert ten.cores > one.cores and ten.bytes_a_day > one.bytes_a_day
-    most = scale.holds(costs, 10, 30e6, 1.0, lambda need: need.gas_a_second)
+            assert ten.cores > one.cores and ten.bytes_a_day > one.bytes_a_day and ten.shards >= one.shards
+    most = scale.most(costs, 10, 1.0, gas_a_second=30e6)
     assert scale.need(costs, most, 10, 1.0).gas_a_second <= 30e6 < scale.need(costs, most + 1, 10, 1.0).gas_a_second
+    borne = scale.most(costs, 10, 1.0, submitter_cores=1.0)
+    assert (scale.need(costs, borne, 10, 1.0).shards, scale.need(costs, borne + 1, 10, 1.0).shards) == (1, 2)

@@ -29,7 +29,7 @@ from rosbridge_eth.identity import check_name
 from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
 from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.robot.sources import Offer
+from rosbridge_eth.robot.sources import Offer, Selection
 from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
 from rosbridge_eth.terminal import errors, live, plain, table, talk
 
@@ -60,7 +60,7 @@ def join(
 ) -> None:
     """Make this machine a robot: its keys, topics, and a request. The operator's `register` answers it.
 
-    The answer is a bundle: put it into the robot's home, where `robot` takes it up. A bundle of `register` without a
+    The answer is a bundle: put it into the robot's home, and `robot` joins with it. A bundle of `register` without a
     request holds the robot's keys and is all there is to join with.
     """
     place = RobotHome(home)
@@ -98,7 +98,7 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
         with closing(everything(config)) as opened:
             offers = offered(opened)
         if topics and not opened.live:
-            config.selection().resolve_all(offers, str(source))
+            Selection.of(config).resolve_all(offers, str(source))
             offers = []
         topics = topics or sorted({offer.topic for offer in offers} - PLUMBING)
         if asks and offers:
@@ -160,7 +160,7 @@ def robot(
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
-    if joined := bundles.take_up(place):
+    if joined := bundles.join_with_answer(place):
         _say_who(joined)
     end = place.bridge()
     settings = load_robot_config(place.config)

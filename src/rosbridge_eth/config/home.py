@@ -22,7 +22,7 @@ A robot's home (made by `join`):
     robot.toml           its topics
     bridge.json          the server, and the ledger it writes to; absent until it has its bundle
     request.json         what it asks the operator to certify, where it made its own keys
-    NAME.bundle          the operator's answer, which `robot` takes up and removes
+    NAME.bundle          the operator's answer, which `robot` joins with and removes
     identity/            its keys, under its own password, its certificates, and the CA's
     readers/NAME.pem     who may read what it writes
     spool.sqlite         its replica of its log
@@ -253,7 +253,7 @@ class RobotHome:
 
     @property
     def answer(self) -> Path:
-        """Where the bundle that answers the request is put, for `robot` to take up."""
+        """Where the bundle that answers the request is put, for `robot` to join with."""
         return self.path / f"{self._head()['name']}.bundle"
 
     def _head(self) -> dict[str, Any]:

@@ -50,11 +50,11 @@ def parse_config(model: type[_Config], text: str, file: Path) -> _Config:
 
 
 def reread(running: _Config, new: _Config, keys: Collection[str]) -> tuple[_Config, str]:
-    """What a process that goes by `running` goes by after it has read `new`: these keys of it; and a sentence."""
+    """The configuration of a running process after a reload: these keys are as in `new`; and a sentence about it."""
     kept = running.model_copy(update={key: getattr(new, key) for key in keys})
     waits = [key for key in type(running).model_fields if getattr(new, key) != getattr(kept, key)]
-    rest = f"; what changed besides holds from the next start on: {', '.join(waits)}" if waits else ""
-    return kept, f"taken up: {', '.join(keys)}{rest}"
+    rest = f"; changed, but not before the next start: {', '.join(waits)}" if waits else ""
+    return kept, f"reloaded: {', '.join(keys)}{rest}"
 
 
 def _read(path: Path, example: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (  # isort: skip
     AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, WithJsonSchema,
@@ -23,9 +23,6 @@ from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort,
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.log.chunk import MAX_READERS
 from rosbridge_eth.robot.blackbox import Condition, TriggerRule
-
-if TYPE_CHECKING:
-    from rosbridge_eth.robot.sources import Selection
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
 
@@ -320,7 +317,7 @@ class RobotConfig(Section):
     channel: How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.
 
     readers: Certificates (PEM) of those who may read the records, 16 at most; without it, those in the folder `readers`
-    of the home: the bundle's and what is put there by hand. A bundle that is taken up removes what it does not name.
+    of the home: the bundle's and what is put there by hand. Joining again removes what its bundle does not name.
 
     monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there are none.
     Keep it on the machine or a private network.
@@ -412,12 +409,6 @@ class RobotConfig(Section):
                 ' messages, "sim"'
             )
         return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
-
-    def selection(self) -> Selection:
-        """For sources.open_source."""
-        from rosbridge_eth.robot.sources import Selection
-
-        return Selection([topic.topic for topic in self.topics], self.nodes)
 
     def reader_files(self, joined: Path) -> list[Path]:
         """The readers' certificates, 1 to 16: as configured, or those in the folder `joined`. Else ConfigError."""

@@ -2,14 +2,15 @@
 
     chunk     = header | signature 64 | body
     header    = version 1 | flags 1 | stream 16 | number 8 | previous 32 | sealed at, ms since 1970, 8
-              | records 4 | root 32 | body length 4 | body digest 32 | n 1 | n * (tag 8 | wrapped key 113)
-    body      = SM4-GCM(key, nonce 0, associated data ledger | Tk | stream | number, plaintext)
+              | records 4 | root 32 | body length 4 | body digest 32 | n 1 | n * wrapped key 113
+    body      = SM4-GCM(body key, nonce 0, associated data ledger | Tk | stream | number, plaintext)
     plaintext = one zstd frame (RFC 8878), then zeros to a multiple of 64
     content   = what the frame holds: the records, one line each, every line ended by 0A
 
 Numbers are big-endian, hashes SM3, signatures SM2. The signature is over ledger | Tk | header for the
 purpose "chunk", or "dropped" where the robot itself removed the body; see identity. The root is the Merkle
-tree of RFC 9162, 2.1, over salted lines. docs/log.md says all of it byte by byte.
+tree of RFC 9162, 2.1, over salted lines. What is wrapped is the content key, of which body key and salt key
+are derived. docs/log.md says all of it byte by byte.
 
 Not here: what a line says (capture), when a chunk is closed (writer), which certificate governs (reading).
 """
@@ -20,7 +21,6 @@ import secrets
 import struct
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING or sys.version_info < (3, 14):
 else:
     from compression import zstd
 
-VERSION: Final = 2
+VERSION: Final = 3
 #: The only flag: the last chunk of an orderly run.
 GOODBYE: Final = 1
 
@@ -51,9 +51,8 @@ MAX_TIME_MS: Final = 253_402_300_800_000
 
 STREAM_SIZE: Final = 16
 KEY_SIZE: Final = 16
-_SALT, _TAG, _GCM_TAG, _HASH, _BLOCK = 16, 8, 16, 32, 64
-_WRAPPED = 1 + 64 + _HASH + KEY_SIZE  # C1 | C3 | C2, GB/T 32918.4
-_GRANT = _TAG + _WRAPPED
+_SALT, _GCM_TAG, _HASH, _BLOCK = 16, 16, 32, 64
+_GRANT = 1 + 64 + _HASH + KEY_SIZE  # C1 | C3 | C2, GB/T 32918.4
 _FIXED = struct.Struct(">BB16sQ32sQI32sI32sB")
 MAX_HEADER: Final = _FIXED.size + MAX_READERS * _GRANT
 MAX_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_BODY
@@ -136,7 +135,7 @@ class Header:
     root: bytes
     body_length: int
     body_digest: bytes
-    grants: tuple[tuple[bytes, bytes], ...] = field(repr=False)
+    grants: tuple[bytes, ...] = field(repr=False)
     encoded: bytes = field(repr=False)
     digest: bytes
 
@@ -158,9 +157,7 @@ class Header:
             raise Malformed(f"a chunk of version {version} with flags {flags} is not known here")
         if len(data) != _FIXED.size + count * _GRANT:
             raise Malformed(f"a header with {count} grants does not have {len(data)} bytes")
-        grants = tuple(
-            (data[at : at + _TAG], data[at + _TAG : at + _GRANT]) for at in range(_FIXED.size, len(data), _GRANT)
-        )
+        grants = tuple(data[at : at + _GRANT] for at in range(_FIXED.size, len(data), _GRANT))
         name = sm3.digest(data)
         header = Header(flags, stream, number, previous, sealed, records, root, size, digest, grants, data, name)
         if sealed >= MAX_TIME_MS:
@@ -219,13 +216,14 @@ class Chunk:
 def seal(
     log: Log, key: sm2.PrivateKey, lines: Sequence[bytes], *,
     stream: bytes, number: int, previous: bytes, sealed_ms: int, readers: Sequence[sm2.PublicKey],
-    goodbye: bool = False, compress: bool = True, level: int = LEVEL,
+    goodbye: bool = False, compress: bool = True, level: int = LEVEL, secret: bytes | None = None,
     randomness: Randomness = secrets.token_bytes,
 ) -> Chunk:
     """The chunk that holds `lines`, signed with the robot's `key` and encrypted to `readers` (1 to 16).
 
     lines: not empty and without newline, each; none at all make a chunk without body. previous: the digest of
     the header before. compress=False stores the lines as they are, so that sizes tell nothing of the content.
+    secret: a `content_secret` of the robot, for all chunks of a run; None makes one, which costs a signature.
     TooLarge if the lines do not fit; then nothing was used up.
     """
     root, body, grants = _EMPTY, b"", b""
@@ -234,18 +232,26 @@ def seal(
             raise ValueError(f"a chunk is for 1 to {MAX_READERS} readers, not {len(readers)}")
         plaintext = _pack(lines, compress, level)
         place = stream + number.to_bytes(8, "big")
-        secret = sm3.hmac(key.to_bytes(), b"rosbridge-eth/2 content key")
         fresh = randomness(32) + log.ledger + log.tk + place + sm3.digest(plaintext)
-        new_key = sm3.hmac(secret, fresh)[:KEY_SIZE]
-        body = sm4.SM4GCM(new_key).encrypt(bytes(12), plaintext, log.ledger + log.tk + place)
+        new_key = sm3.hmac(content_secret(key) if secret is None else secret, fresh)[:KEY_SIZE]
+        body = sm4.SM4GCM(_body_key(new_key)).encrypt(bytes(12), plaintext, log.ledger + log.tk + place)
         root = _levels(_leaves(lines, new_key))[-1][0]
-        grants = b"".join(_tag(place, reader) + reader.encrypt(new_key, encoding="c1c3c2") for reader in readers)
+        grants = b"".join(reader.encrypt(new_key, encoding="c1c3c2") for reader in readers)
     fixed = _FIXED.pack(
         VERSION, GOODBYE * goodbye, stream, number, previous, sealed_ms,
         len(lines), root, len(body), sm3.digest(body), len(grants) // _GRANT,
     )  # fmt: skip
     header = Header.parse(fixed + grants)
     return Chunk(header, identity.sign(key, "chunk", _signed(log, header)), body)
+
+
+def content_secret(key: sm2.PrivateKey) -> bytes:
+    """The secret behind the content keys of a run, 32 bytes: SM3 of a signature that nobody else sees.
+
+    A signature is all that is asked of the key, so that it may live in a token; without the key its s cannot be
+    computed, not even by who knows every random byte.
+    """
+    return sm3.digest(identity.sign(key, "content-keys", b""))
 
 
 def drop(log: Log, key: sm2.PrivateKey, chunk: Chunk) -> Chunk:
@@ -290,8 +296,13 @@ def _signed(log: Log, header: Header) -> bytes:
     return log.ledger + log.tk + header.encoded
 
 
-def _tag(place: bytes, reader: sm2.PublicKey) -> bytes:
-    return sm3.digest(place + reader.to_bytes())[:_TAG]
+def _body_key(content_key: bytes) -> bytes:
+    return _expanded(content_key, b"rosbridge-eth/3 body")[:KEY_SIZE]
+
+
+def _expanded(key: bytes, label: bytes) -> bytes:
+    """HKDF-Expand with SM3, one block of 32 bytes (RFC 5869, 2.3)."""
+    return sm3.hmac(key, label + b"\1")
 
 
 # Checking and opening
@@ -318,19 +329,27 @@ def verify_signature(log: Log, public_key: sm2.PublicKey, chunk: Chunk) -> None:
 
 
 def content_key(header: Header, reader: sm2.PrivateKey) -> bytes:
-    """The 16-byte key of the chunk's body; NoGrant if it was not wrapped to `reader`, Unopenable if wrongly."""
-    tag = _tag(header.stream + header.number.to_bytes(8, "big"), reader.public_key)
-    wrapped = [grant for name, grant in header.grants if name == tag]
-    for grant in wrapped:
-        with suppress(InvalidCiphertext):
-            return reader.decrypt(grant, encoding="c1c3c2")
-    if wrapped:
-        raise Unopenable(f"the key that {header} grants to this reader does not decrypt")
+    """The 16-byte key of the chunk's body; NoGrant if it was not wrapped to `reader`."""
+    return unwrap(header, reader)[0]
+
+
+def unwrap(header: Header, reader: sm2.PrivateKey, likely: int = 0) -> tuple[bytes, int]:
+    """As `content_key`, with the index of the grant that fitted.
+
+    likely: the index to be tried first, as a robot gives its grants the same order in every chunk. Each that does
+    not fit costs a multiplication on the curve.
+    """
+    order = sorted(range(len(header.grants)), key=lambda index: index != likely)
+    for index in order:
+        try:
+            return reader.decrypt(header.grants[index], encoding="c1c3c2"), index
+        except InvalidCiphertext:
+            continue
     raise NoGrant(f"{header} was not granted to this reader")
 
 
 def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:
-    """The records of `chunk`; Unopenable unless tag, frame, padding, number of records and root are right.
+    """The records of `chunk` under its content key; Unopenable unless tag, frame, padding, number and root are right.
 
     The chunk is not bare; its signature is `verify`'s matter.
     """
@@ -341,7 +360,7 @@ def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:
         return ()
     associated = log.ledger + log.tk + header.stream + header.number.to_bytes(8, "big")
     try:
-        plaintext = sm4.SM4GCM(key).decrypt(bytes(12), chunk.body, associated)
+        plaintext = sm4.SM4GCM(_body_key(key)).decrypt(bytes(12), chunk.body, associated)
     except InvalidTag:
         raise Unopenable(f"{header} does not open with this key") from None
     lines = _unpack(header, plaintext)
@@ -424,12 +443,12 @@ _OPAD = bytes(x ^ 0x5C for x in range(256))
 
 
 def _salts(key: bytes, indexes: Iterable[int]) -> Iterator[bytes]:
-    """The first 16 bytes of HMAC-SM3(key, index in 4 bytes), for each index.
+    """The first 16 bytes of HMAC-SM3(salt key, index in 4 bytes), for each index; key: the content key.
 
     RFC 2104 written out with the pads made once: 4.1 us a salt where `sm3.hmac` takes 7.0 and copies of two
     started hashes take 4.2.
     """
-    block = key.ljust(sm3.SM3.block_size, b"\0")
+    block = _expanded(key, b"rosbridge-eth/3 salts").ljust(sm3.SM3.block_size, b"\0")
     inner, outer = block.translate(_IPAD), block.translate(_OPAD)
     for index in indexes:
         yield sm3.digest(outer + sm3.digest(inner + index.to_bytes(4, "big")))[:_SALT]

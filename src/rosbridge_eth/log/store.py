@@ -4,9 +4,9 @@ A chunk's *place* is stream | number, 24 bytes; places order as the log does, si
 at which it was begun. A robot is named by its Tk. Its *head* is the place up to which its log was taken, and stays
 where it is when rows are removed.
 
-The rule: a chunk is taken if it follows the head (its `previous` is the digest there), or if the robot says that it is
-the oldest it still has. So whoever sends is told the head, and sends what follows it; a replica that was lost, or put
-back from an old copy, says a lower head and is sent the rest.
+The rule: a chunk is taken if it follows the head: its `previous` is the digest there, or the robot says that it has
+nothing else behind that digest. So whoever sends is told the head, and sends what follows it; a replica that was lost,
+or put back from an old copy, says a lower head and is sent the rest.
 
 Rows up to the confirmed place are on the chain, and kept for some time, since the chain may still turn back. Every
 write is named by its place, so that one that is carried out twice changes nothing. `now` is seconds since 1970.
@@ -34,25 +34,29 @@ class Outcome(Enum):
     """What became of a chunk. STORED and KNOWN are durable."""
 
     STORED = "stored"
-    KNOWN = "known"  # it, or its dropped or whole form, is here, or was and is behind the rows
+    KNOWN = "known"  # it, or its dropped or whole form, is here, or was, below the rows
     NOT_NEXT = "not next"  # it does not follow the head: the sender is to go on from there
     DIFFERENT = "different"  # the log went on otherwise here: another chunk has the place, or follows the one before
     FULL = "full"  # no room for it, nor for any later one of this robot in the same call: send again later
 
 
 class Offer(NamedTuple):
-    """A chunk of the robot `tk`. oldest: the robot says that it has nothing between the head and this chunk."""
+    """A chunk of the robot `tk`.
+
+    after: the digest behind which the robot has nothing else than this chunk, where that is not the chunk's `previous`:
+    what stood between them it gave up, or never had.
+    """
 
     tk: bytes
     chunk: Chunk
-    oldest: bool = False
+    after: bytes = b""
 
 
 class State(NamedTuple):
     """What is kept of a robot beside its rows.
 
     head, digest: the place up to which the log was taken, and the digest of the header there.
-    base: keccak256 of the chunk in front of the first row, NO_HASH if there is none.
+    base: keccak256 of the chunk in front of the first row, NO_HASH if there is none; a row with that hash comes first.
     confirmed, block: the newest place that is confirmed on the chain, and the number of the block that has it.
     hold: why nothing is written for the robot, "" where nothing stands in the way.
     certificates: keccak256 of the certificates that the contract has for it, b"" where that is not known yet.
@@ -100,6 +104,11 @@ def place_of(header: Header) -> bytes:
     return header.stream + header.number.to_bytes(8, "big")
 
 
+def successor(place: bytes) -> bytes:
+    """The place after it in the same stream."""
+    return place[:16] + ((int.from_bytes(place[16:], "big") + 1) % 2**64).to_bytes(8, "big")
+
+
 class Store(Protocol):
     """Durable: what `append`, `set_state` and `remove` changed is committed when they return.
 
@@ -113,11 +122,17 @@ class Store(Protocol):
     def append(self, offers: Sequence[Offer], now: float) -> list[Outcome]:
         """Take chunks by the rule, those of one robot in one commit; one outcome for each, in order.
 
-        Checked in this order: a row at its place (KNOWN if its digest is the same, else DIFFERENT); at the head's place
-        likewise; below the first row, or below the head where there are no rows: KNOWN; below the head: DIFFERENT; does
-        not follow the head and is not the oldest: NOT_NEXT; does not follow the head although the chunk that it names
-        as the one before is a row here, which something else follows: DIFFERENT; beyond the robot's share or the whole
-        bound: FULL; else STORED, and the head is there.
+        Checked in this order:
+
+        1. another header at its place, as a row or the head: DIFFERENT
+        2. not above the head: KNOWN; but DIFFERENT between rows, or between the rows and the head
+        3. above the head, and its `previous` is not the digest there:
+           a. the log went on otherwise here, which no honest robot's does: its place is the one after the head's in the
+              same stream, or the chunk that it names is a row and not the newest below its place: DIFFERENT
+           b. NOT_NEXT, unless the offer's `after` is the digest of the head
+        4. a row already, as there are above a head that `follow` has lowered: KNOWN, and the head is there
+        5. beyond the robot's share or the whole bound: FULL, and so is any later one of the robot
+        6. else STORED, and the head is there
         """
 
     def states(self, tks: Sequence[bytes]) -> list[State]:
@@ -161,6 +176,7 @@ class Store(Protocol):
     def follow(self, tk: bytes, hash: bytes, tail: Header | None) -> None:
         """Make the log whole up to the chain's last chunk (None: it has none), which is neither a row nor in front of
         the first one. hash: its keccak256. The robot is asked for what follows; rows behind it stay until it is there.
+        This is the one place where a head goes back, but for a store that was lost or put back.
         """
         place, digest = (NOWHERE, NO_DIGEST) if tail is None else (place_of(tail), tail.digest)
         self.set_state(tk, head=place, digest=digest, base=hash)
@@ -171,10 +187,15 @@ class Store(Protocol):
         """Remove confirmed rows that were taken before that time, or are beyond `keep` bytes, the oldest first; the
         newest confirmed one stays."""
         [state], size = self.states([tk]), self.sizes().get(tk, 0)
-        while gone := [
-            row for row in self.rows(tk, NOWHERE, 200)
-            if row.place < state.confirmed and (row.taken_at < before or size > keep)
-        ]:  # fmt: skip
-            size -= sum(row.size for row in gone)
-            self.set_state(tk, base=gone[-1].hash)
-            self.remove(tk, [row.place for row in gone])
+        going = True
+        while going and (rows := self.rows(tk, NOWHERE, 200)):
+            gone: list[Row] = []
+            for row in rows:
+                going = row.place < state.confirmed and (row.taken_at < before or size > keep)
+                if not going:
+                    break
+                gone.append(row)
+                size -= row.size
+            if gone:
+                self.set_state(tk, base=gone[-1].hash)
+                self.remove(tk, [row.place for row in gone])

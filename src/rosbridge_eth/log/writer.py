@@ -46,7 +46,7 @@ class LogWriter:
         self._log, self._key, self._readers = log, key, tuple(readers)
         self._previous, self._stream_line = previous, _check(stream_line)
         self._period, self._heartbeat, self._compress = period, heartbeat, compress
-        self._randomness = randomness
+        self._randomness, self._secret = randomness, chunk.content_secret(key)
         self._now = self._last_chunk = now
         self._waiting: deque[tuple[float, bytes, tuple[str, bytes] | None, str]] = deque()  # as `add` was given them
         self._bytes = 0
@@ -132,7 +132,7 @@ class LogWriter:
             sealed = chunk.seal(
                 self._log, self._key, lines, stream=self.stream, number=self._number, previous=self._previous,
                 sealed_ms=min(max(wall_ms, 0), MAX_TIME_MS - 1), readers=self._readers, goodbye=goodbye,
-                compress=self._compress, randomness=self._randomness,
+                compress=self._compress, secret=self._secret, randomness=self._randomness,
             )  # fmt: skip
         except TooLarge:
             middle = len(lines) // 2

@@ -207,7 +207,7 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> Join
     return Joined(roots[0].fingerprint().hex(), sorted(bundle.readers))
 
 
-def take_up(home: RobotHome) -> Joined | None:
+def join_with_answer(home: RobotHome) -> Joined | None:
     """Join with the bundle that was put into the home (RobotHome.answer), which then goes; None where there is none.
 
     A robot that has joined goes on as it is where that fails.
@@ -217,7 +217,7 @@ def take_up(home: RobotHome) -> Joined | None:
     try:
         joined = join(home, read_bundle(home.answer.read_bytes()))
     except (BridgeError, OSError) as error:
-        said = f"{home.answer} is not taken up: {error}"
+        said = f"{home.answer} is not used: {error}"
         if not home.bridge_file.exists():
             raise IdentityError(said) from error
         log.error("%s", said)

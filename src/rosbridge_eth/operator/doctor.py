@@ -34,7 +34,7 @@ from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError
 from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
 from rosbridge_eth.operator.bundle import needs_password, read_bundle
-from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.operator.registry import Registry, differences
 from rosbridge_eth.operator.status import ANSWER_TIME, span
 from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
@@ -302,11 +302,10 @@ def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
                          f"send ETH to {home.account}")
         else:
             yield ok("treasury", f"{treasury:.4f} ETH")
-        robots = {tk: robot for tk, robot in opened.robots().items() if robot.revoked_at is None}
-        for robot, standing in zip(robots.values(), ledger.standings([*robots]), strict=True):
-            if standing.certificates_hash != robot.hash or standing.revoked:
-                yield broken("registration", f"the contract has {robot.name} with other certificates, or revoked",
-                             f"run `register {robot.name} REQUEST --replace`, or restore a newer registry.sqlite")
+        robots = [*opened.robots()]
+        standings = dict(zip(robots, ledger.standings(robots), strict=True))
+        for name, difference in differences(opened.all(), standings).items():
+            yield broken("registration", f"{name}: {difference}")
 
 
 # A robot's home
@@ -337,7 +336,7 @@ def readers(home: RobotHome, secret: bytes | None) -> Findings:
 def source(home: RobotHome, secret: bytes | None) -> Findings:
     config = load_robot_config(home.config)
     settings, why = config.source_and_why(os.environ)
-    with closing(sources.open_source(settings, config.selection())) as opened:
+    with closing(sources.open_source(settings, sources.Selection.of(config))) as opened:
         offers = offered(opened)
     if settings.kind == "sim":
         yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from eth_hash.auto import keccak
 
@@ -20,6 +20,9 @@ from rosbridge_eth.errors import IdentityError, StoreError
 from rosbridge_eth.identity import PeerIdentity, Role
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.log.database import DAMAGED
+
+if TYPE_CHECKING:
+    from rosbridge_eth.ledger import Standing
 
 OWNER = "owner"
 """The reader that `init` makes."""
@@ -191,3 +194,32 @@ class Registry:
     def in_force(self) -> dict[bytes, bytes]:
         """Every robot in force: Tk to keccak256 of its certificates. StoreError as `revision`."""
         return {tk: robot.hash for tk, robot in self.robots().items() if robot.revoked_at is None}
+
+
+def differences(enrolled: Iterable[Enrolment], standings: Mapping[bytes, Standing]) -> dict[str, str]:
+    """By name, of the robots in force: what the contract says otherwise, and what to do.
+
+    enrolled: all that there ever were. standings: by Tk, as a node tells them; a name that is not there is not judged.
+    The contract hears of a registration before the registry does, and of a revocation after it. So where they differ
+    the node is behind, or the registry is an older copy.
+    """
+    found, before = dict[str, str](), dict[bytes, set[bytes]]()
+    for robot in enrolled:
+        if robot.role != Role.ROBOT or (standing := standings.get(robot.tk)) is None:
+            continue
+        known = before.setdefault(robot.tk, set())
+        if robot.revoked_at is not None:
+            known.add(robot.hash)
+        elif standing.account is None or standing.certificates_hash in known:
+            found[robot.name] = "the node does not have its registration yet: wait until the node has caught up"
+        elif standing.certificates_hash != robot.hash:
+            found[robot.name] = (
+                "the contract has certificates that this registry does not know, so the registry is an older copy:"
+                f" restore a newer registry.sqlite, or run `register {robot.name} REQUEST --replace`"
+            )
+        elif standing.revoked:
+            found[robot.name] = (
+                "it was revoked on the chain, which this registry does not know, so the registry is an older copy:"
+                f" run `revoke {robot.name}`, or `register {robot.name} REQUEST --replace` to let it write again"
+            )
+    return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -24,7 +24,7 @@ from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityE
 from rosbridge_eth.identity import Role
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
-from rosbridge_eth.operator.registry import Enrolment, Registry
+from rosbridge_eth.operator.registry import Enrolment, Registry, differences
 from rosbridge_eth.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
 
@@ -133,7 +133,7 @@ def _operator(place: OperatorHome, name: str | None = None) -> Report:
             except ChainError as error:
                 report["wrong_chain"] = str(error)
                 raise
-            _add_standings(report, ledger, robots, round(config.funds.by * _WEI))
+            _add_standings(report, ledger, enrolled, robots, round(config.funds.by * _WEI))
             if name is not None:
                 report["robots"][name]["log"] = _log(ledger, tk, head.number - config.chain.confirmations + 1)
     report["alarms"] = [*_alarms(report)]
@@ -168,8 +168,11 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
                       for (tk, why), count in reasons.items()]  # fmt: skip
 
 
-def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolment], top_up: int) -> None:
-    """What the chain has of each robot, and how long its account and the operator's last at what robots spent lately.
+def _add_standings(
+    report: Report, ledger: Ledger, enrolled: Sequence[Enrolment], robots: Mapping[bytes, Enrolment], top_up: int
+) -> None:
+    """What the chain has of each robot, what it says otherwise than the registry, and how long the robots' accounts and
+    the operator's last at what robots spent lately.
 
     top_up: wei that an account is given at once. One that has more than before was given that.
     """
@@ -177,18 +180,26 @@ def _add_standings(report: Report, ledger: Ledger, robots: Mapping[bytes, Enrolm
     before: dict[bytes, Standing] = {}
     treasury = ledger.balance(operator["account"])
     operator["eth"] = treasury / _WEI
+    standings = dict(zip(robots, ledger.standings([*robots]), strict=True))
+    report["differences"] = differences(enrolled, standings)
     block = max(1, head - SPENDING_BLOCKS)
-    with _asking(report, f"how long accounts last, by their balances in block {block}"):
+    try:
         before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
         seconds = ledger.block_time(head) - ledger.block_time(block)
-    for (tk, robot), now in zip(robots.items(), ledger.standings([*robots]), strict=True):
-        known = before.get(tk)
+    except ChainError:
+        report["unknown"].append(
+            f"how long accounts last: not known, as the node does not have the balances of block {block} (geth keeps"
+            " those of the last 128 blocks, anvil none from before its last start)"
+        )
+    for tk, now in standings.items():
+        robot, known = robots[tk], before.get(tk)
         less = known.balance - now.balance if known is not None and known.account == now.account else 0
         spent = less if less >= 0 else less % top_up
         total += spent
         report["robots"][robot.name] |= {
             "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,
             "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
+            "in_force": robot.revoked_at is None and not now.revoked,
         }  # fmt: skip
     operator["days_left"] = _days(treasury, total, seconds)
 
@@ -215,6 +226,8 @@ def _alarms(report: Report) -> Iterator[str]:
     """What somebody has to see to."""
     for condition in report["process"] or ():
         yield f"ALARM: the server is not ready: {condition}: no"
+    for name, difference in report.get("differences", {}).items():
+        yield f"ALARM: {name}: {difference}"
     for name, robot in report["robots"].items():
         if hold := robot.get("hold"):
             yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
@@ -267,12 +280,14 @@ def _process(report: Report) -> list[tuple[str, object]]:
 
 
 def _robots(report: Report, *, money: bool = True) -> RenderableType:
+    """money: what accounts have, too; then addresses have no room, and stand below."""
     columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas"], []
     for name, robot in report["robots"].items():
         waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
         oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
         rows.append((
-            name, (session or robot["address"]) if robot["in_force"] else "revoked", span(robot.get("newest")),
+            name, (session or ("yes" if money else robot["address"])) if robot["in_force"] else "revoked",
+            span(robot.get("newest")),
             _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
             _figure(robot, "chunks", ".0f"), _figure(robot, "block", ".0f"),
             f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?",
@@ -296,8 +311,8 @@ def _show_operator(report: Report) -> Iterator[RenderableType]:
               if each["role"] != Role.ROBOT and each["revoked"] is None]  # fmt: skip
     treasury = "not known" if eth is None else f"{eth:.4f} ETH" + (f", for {days:.1f} days" if days is not None else "")
     yield table("Server", ["what", "value"], [
-        ("contract", f"{contract} on chain {report['chain']}" if contract else "none yet; run `deploy`"),
-        ("last block", head), ("treasury", treasury),
+        ("contract", contract or "none yet; run `deploy`"), ("chain", report.get("chain", "")), ("last block", head),
+        ("treasury", treasury),
         ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
         *_process(report),
     ])  # fmt: skip
@@ -311,6 +326,8 @@ def _show_operator(report: Report) -> Iterator[RenderableType]:
     for name, each in {"operator": report["operator"], **report["robots"]}.items():
         if each["account"]:
             yield f"{each['account']}  {name}"  # whole lines, to be copied
+        if each.get("address"):
+            yield f"{name} sends from {each['address']}"
 
 
 def _show_robot(report: Report) -> Iterator[RenderableType]:
@@ -321,7 +338,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         kept += f" and refused {spool['aside']}" if spool["aside"] else ""
     yield table(f"Robot {report['robot']}", ["what", "value"], [
         ("server", report["server"]), ("topics, nodes", ", ".join([*report["topics"], *report["nodes"]])),
-        ("contract", f"{report['contract']} on chain {report['chain']}"), ("runs", "yes" if report["runs"] else "no"),
+        ("contract", report["contract"]), ("chain", report["chain"]), ("runs", "yes" if report["runs"] else "no"),
         ("spool", kept), *_process(report),
         *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
     ])  # fmt: skip

@@ -276,7 +276,7 @@ const evidence = (() => {
     const isOne = ({ tag, content }) => tag === 2 && content[0] < 0x80 && (content[0] > 0 || !(content[1] < 0x80))
     need(numbers.length === 2 && numbers.every(isOne), 'a certificate is not DER')
     const [r, s] = numbers.map(({ content }) => big(content))
-    Object.assign(found, { r, s, authority: false, usage: null, purposes: null, names: [] })
+    Object.assign(found, { r, s, authority: false, usage: null, names: [] })
     const extensions = rest.find(({ tag }) => tag === 0xa3)
     const there = new Set()
     for (const extension of extensions ? within(one(extensions.content), 0x30) : []) {
@@ -285,19 +285,18 @@ const evidence = (() => {
       need(!there.has(id) && there.add(id), 'a certificate has an extension twice')
       const value = parts.at(-1).content
       if (id === '551d13') found.authority = within(one(value), 0x30).some(({ tag, content }) => tag === 1 && content[0])
-      else if (id === '551d0f') found.usage = bits(one(value))[0] // digitalSignature 80 ... keyAgreement 08, keyCertSign 04
-      else if (id === '551d25') found.purposes = within(one(value), 0x30).map(({ content }) => hex(content))
+      else if (id === '551d0f') found.usage = bits(one(value))[0] // 80 digitalSignature, 40 nonRepudiation ... 08 keyAgreement, 04 keyCertSign
       else if (id === '551d11') {
         found.names = within(one(value), 0x30).map(({ tag, content }) => [tag & 0x1f, String.fromCharCode(...content)])
       } else if (!HARMLESS.has(id)) need(parts.length === 2 || !parts[1].content[0], `a certificate has a critical extension, ${id}`)
     }
     found.constrained = there.has('551d1e') // nameConstraints
+    found.purposes = there.has('551d25') // extendedKeyUsage
     return found
   }
 
   // The robot's signing certificate of a registration, if the CA signed both for this robot; judged by when they begin.
   // What has to hold is the table of docs/log.md (Certificates).
-  const ROBOT = '2b06010505070302' // clientAuth
   function signer(certificates, roots, robot) {
     const first = element(certificates).whole
     const pair = [certificate(first), certificate(certificates.subarray(first.length))]
@@ -307,13 +306,11 @@ const evidence = (() => {
       need(made.names.length === 1 && String(made.names[0]) === name, `a certificate is not for ${robot}`)
       const issued = (root) =>
         root.subject === made.issuer && root.authority && !root.constrained && (root.usage === null || root.usage & 0x04) &&
-        (root.purposes === null || root.purposes.some((use) => [ROBOT, '551d2500'].includes(use))) &&
         root.from <= at && at <= root.until && signed(root.key, made.tbs, made.r, made.s)
       need(roots.some(issued), 'the CA did not sign a certificate')
       need(made.from <= at && at <= made.until, 'a certificate ends before the other begins')
-      const [own, others] = n ? [0x08, 0x80] : [0x80, 0x38]
-      need(made.usage & own && !(made.usage & others), 'a certificate is for another use')
-      need(made.purposes?.includes(ROBOT), 'a certificate is for another purpose')
+      const [own, others] = n ? [0x08, 0xc0] : [0xc0, 0x38]
+      need((made.usage & own) === own && !(made.usage & others) && !made.purposes, 'a certificate is for another use')
       need(!made.authority, "a certificate is a CA's")
     })
     return { key: pair[0].key, fingerprint: hex(sm3(first)), until: Math.min(pair[0].until, pair[1].until) }
@@ -323,9 +320,9 @@ const evidence = (() => {
 
   function chunkOf(data) {
     const count = data[138]
-    const end = 139 + count * 121
+    const end = 139 + count * 113
     const form = (holds) => need(holds, 'a chunk is not in the form of one')
-    form(data.length >= end + 64 && data[0] === 2 && data[1] <= 1 && count >= 1 && count <= 16)
+    form(data.length >= end + 64 && data[0] === 3 && data[1] <= 1 && count >= 1 && count <= 16)
     const header = data.subarray(0, end)
     const field = (at, size) => header.subarray(at, at + size)
     const rest = data.length - end - 64
@@ -405,7 +402,7 @@ const evidence = (() => {
       throw new Wrong('this is no evidence: it is not JSON')
     }
     members(file, 'format,robot,chain_id,genesis,contract,authorities,certificates,chunks,records', 'the file')
-    need(file.format === 'rosbridge-eth evidence 2', 'this is evidence of another format')
+    need(file.format === 'rosbridge-eth evidence 3', 'this is evidence of another format')
     const escaped = (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0')
     need(JSON.stringify(file).replace(/[<\u007f-\uffff]/g, escaped) === text.trim(), 'the file is not in its one form')
     need(typeof file.robot === 'string' && /^[a-z0-9][a-z0-9_.-]{0,62}$/.test(file.robot), 'no robot has such a name')

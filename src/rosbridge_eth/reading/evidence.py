@@ -41,7 +41,7 @@ from smcrypto import CertificateError, InvalidKey, sm2, sm3, x509
 if TYPE_CHECKING:
     from rosbridge_eth.reading.fetch import Reading
 
-FORMAT: Final = "rosbridge-eth evidence 2"
+FORMAT: Final = "rosbridge-eth evidence 3"
 MAX_FILE: Final = 64 * 2**20
 MAX_CHOSEN: Final = 100_000
 MAX_CERTIFICATES: Final = 1_000
@@ -92,7 +92,7 @@ class Written(_Part):
 class Evidence(_Part):
     """What the file holds. certificates: the robot's, each signing and encryption, as they were registered."""
 
-    format: Literal["rosbridge-eth evidence 2"] = FORMAT
+    format: Literal["rosbridge-eth evidence 3"] = FORMAT
     robot: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$")]
     chain_id: Count
     genesis: Hex32

@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
 from rosbridge_eth.log.chunk import Log, robot_id
@@ -29,7 +30,7 @@ class Reading:
     """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
 
     top: the block up to which is read. ledger: on the node that is read. registrations: all of them, as it says.
-    trust: of who reads. topics: that were read so far.
+    trust: of who reads. now: seconds since 1970, by the reader's clock. topics: that were read so far.
     """
 
     verifier: Verifier
@@ -39,6 +40,7 @@ class Reading:
     ledger: Ledger
     registrations: Sequence[RegistrationEvent]
     trust: Trust
+    now: float
     memo: Memo | None = None
     topics: set[str] = field(default_factory=set)
 
@@ -68,7 +70,8 @@ class Reading:
         """Write the bookmark. confirm: the reader has compared the fingerprints of new certificates."""
         bookmark = self.verifier.bookmark(confirm=confirm)
         if bookmark is not None:
-            bookmarks.put(self.verifier.log, bookmark)
+            time = min(self.top.time, self.now) if self.verifier.honest else bookmark.time
+            bookmarks.put(self.verifier.log, replace(bookmark, time=time))
 
 
 def read_robot(
@@ -94,8 +97,15 @@ def read_robot(
         )
     log = Log(ledger.ledger, tk)
     mark = None if bookmarks is None else bookmarks.get(log)
-    if mark is not None and standing.chunks < mark.count and _is_above(ledger, tk, mark, block):
-        mark = replace(mark, count=0)
+    if mark is not None and standing.chunks < mark.count:
+        if _is_above(ledger, tk, mark, block):
+            mark = replace(mark, count=0)
+        elif top.time < mark.time:
+            raise ChainError(
+                f"node {shown(ledger.url)} is behind: its block {block:,} is of {time_text(int(top.time * 10**9))}, and"
+                f" what was read before of {time_text(int(mark.time * 10**9))}; wait until it has caught up, or name"
+                " another node"
+            )
     at, links, first_block = Progress(), Links(), registrations[0].block if registrations else 0
     if before is not None and not differing and _goes_on(ledger, before, block, registrations):
         at, links, first_block = before.verifier.progress(), before.verifier.links, before.top.number + 1
@@ -110,7 +120,7 @@ def read_robot(
     for difference in differing:
         verifier.findings.add(Kind.CONTRADICTED, max(0, standing.chunks - 1), detail=difference)
     chunks = verifier.read(ledger.data_events(tk, first_block, standing.data_block))
-    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, registrations, trust, facts)
+    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, registrations, trust, now, facts)
 
 
 def _goes_on(ledger: Ledger, before: Reading, block: int, registrations: Sequence[RegistrationEvent]) -> bool:

@@ -188,12 +188,14 @@ class Progress:
 class Bookmark:
     """How far a reading has come; kept, so that the reader cannot be shown another log, unseen.
 
-    count: chunks read. digest: hex of the last one's identity. fingerprints: certificates that were accepted.
+    count: chunks read. digest: hex of the last one's identity. fingerprints: certificates that were accepted. time: of
+    the newest block that was read up to, seconds since 1970, and not later than the reader's clock.
     """
 
     count: Annotated[int, Field(ge=0)] = 0
     digest: str = ""
     fingerprints: tuple[str, ...] = ()
+    time: float = 0.0
 
 
 class _File(BaseModel, strict=True, extra="forbid"):

@@ -19,7 +19,7 @@ from eth_hash.auto import keccak
 from rosbridge_eth.capture import LostLine, MessageLine, StreamLine, TriggerLine, TypeLine, parse_line
 
 from rosbridge_eth.log.chunk import (  # isort: skip
-    Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, content_key, open_lines, robot_id,
+    Chunk, Forged, Header, Log, Malformed, NoGrant, Unopenable, open_lines, robot_id, unwrap,
     verify_signature,
 )  # fmt: skip
 from rosbridge_eth.config.values import time_text
@@ -158,6 +158,7 @@ class Verifier:
         self._timed = -1, 0  # the latest block and its time
         self._signers = [self._signer(event) for event in registrations]
         self._current = -1  # the one of them that governs the next chunk
+        self._grant = 0  # the index of the grant that fitted last
         self._check_registrations(registrations)
         if mark is not None and mark.count > standing.chunks:
             detail = f"{mark.count:,} chunks then, {standing.chunks:,} now"
@@ -352,7 +353,7 @@ class Verifier:
     # --- content
 
     def key_of(self, header: Header) -> bytes:
-        """The content key, for this reader on the chain or handed over to it; NoGrant, Unopenable."""
+        """The content key, for this reader on the chain or handed over to it; else NoGrant."""
         try:
             if self._reader is None:
                 raise NoGrant(f"{header} is opened with a reader's key")
@@ -360,7 +361,7 @@ class Verifier:
             known = self._facts and self._facts.get(name)
             if known:
                 return known
-            key = content_key(header, self._reader)
+            key, self._grant = unwrap(header, self._reader, self._grant)
             if self._facts is not None:
                 self._facts[name] = key
             return key

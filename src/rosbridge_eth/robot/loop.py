@@ -33,7 +33,7 @@ from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
-from rosbridge_eth.robot.sources import BagSource, Source, open_source
+from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
 from rosbridge_eth.spool import Spool
 from smcrypto import __version__, sm2, x509
 
@@ -100,7 +100,7 @@ class Robot:
         self._add_losses(time.monotonic())
         self.box.take_up(config.triggers())
         self.capture.take_up(config.rules())
-        self.source.watch(config.selection())
+        self.source.watch(Selection.of(config))
         self.writer.take_up(readers)
 
     def fire(self, why: str, name: str | None = None) -> None:
@@ -389,7 +389,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     identity, roots = load_identity(home.identity, password)
     readers = reader_keys(config, home, roots)
     settings, _ = config.source_and_why(os.environ)
-    source = open_source(settings, config.selection())
+    source = open_source(settings, Selection.of(config))
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
     box = BlackBox(config.triggers())
     for topic, decoders in source.decoders().items():
@@ -431,7 +431,7 @@ def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConf
         roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
         robot.take_up(config, reader_keys(config, home, roots))
     except (BridgeError, OSError) as error:
-        log.error("nothing is taken up: %s", error)
+        log.error("nothing is reloaded: %s", error)
         return running
     log.warning("%s", said)
     return config

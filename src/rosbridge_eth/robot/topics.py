@@ -137,7 +137,7 @@ def survey(
         source.close()
     times = [time for topic in heard.values() for time in topic.times]
     took = time.monotonic() - began if source.live else (max(times) - min(times)) / 1e9 if times else 0.0
-    selection, days = config.selection(), max(took, 1.0) / DAY
+    selection, days = Selection.of(config), max(took, 1.0) / DAY
     chosen = [topic for topic in heard.values() if selection.wants(topic.offer) and topic.offer.topic not in without]
     chunks = _sealed([line for topic in chosen for line in topic.all_day], config, source.kind, readers)
     sizes = [len(chunk.encoded) for chunk in chunks]

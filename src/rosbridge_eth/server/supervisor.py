@@ -57,7 +57,7 @@ PATIENT = frozenset({ExitCode.CHAIN, ExitCode.STORE})
 """Ends for which one waits as long as it takes: the node, the disk or Redis is away, and people mend that."""
 
 TAKEN_UP = ("channel", "chain", "store", "funds")
-"""Keys of server.toml that SIGHUP takes up: those that the parent, its sockets and certificates do not rest on."""
+"""Keys of server.toml that SIGHUP reloads: those that the parent, its sockets and certificates do not rest on."""
 
 SUBMITTER, MONITOR = "submitter", "monitor"
 _FORK = multiprocessing.get_context("fork")
@@ -189,7 +189,7 @@ class Supervisor:
             config, said = reread(self._config, load_server_config(self._home.config), TAKEN_UP)
             self._check(config)
         except BridgeError as error:
-            log.error("nothing is taken up: %s", error)
+            log.error("nothing is reloaded: %s", error)
             return
         self._config = config
         log.warning("%s", said)

@@ -16,7 +16,15 @@ from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.config.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.identity import Role, load_identity
-from rosbridge_eth.operator.bundle import Bundle, Request, ask_to_join, join, needs_password, read_bundle, take_up
+from rosbridge_eth.operator.bundle import (
+    Bundle,
+    Request,
+    ask_to_join,
+    join,
+    join_with_answer,
+    needs_password,
+    read_bundle,
+)
 from rosbridge_eth.robot.loop import reader_keys
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
@@ -303,13 +311,13 @@ def test_a_bundle_that_cannot_be_taken_up_ends_no_robot_that_has_joined(
 ) -> None:
     bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
     home.answer.write_bytes(bundle.encode()[:-100])  # a copy that was cut short
-    with pytest.raises(IdentityError, match=f"{home.answer} is not taken up: this is no bundle file .* damaged"):
-        take_up(home)
+    with pytest.raises(IdentityError, match=f"{home.answer} is not used: this is no bundle file .* damaged"):
+        join_with_answer(home)
     join(home, bundle)
-    assert take_up(home) is None and home.answer.exists()
-    assert f"{home.answer} is not taken up: this is no bundle file" in caplog.text
+    assert join_with_answer(home) is None and home.answer.exists()
+    assert f"{home.answer} is not used: this is no bundle file" in caplog.text
     home.answer.write_bytes(bundle.encode())
-    assert take_up(home) is not None
+    assert join_with_answer(home) is not None
 
 
 def test_a_damaged_bridge_file_is_mended_by_joining_again_as_its_error_says(home: RobotHome) -> None:
@@ -319,7 +327,7 @@ def test_a_damaged_bridge_file_is_mended_by_joining_again_as_its_error_says(home
     with pytest.raises(ConfigError, match="join again"):
         home.bridge()
     home.answer.write_bytes(bundle.encode())
-    assert take_up(home) is not None and home.bridge() == END
+    assert join_with_answer(home) is not None and home.bridge() == END
 
 
 def test_a_bundle_that_answers_no_request_is_not_passed_over_without_a_word(
@@ -329,9 +337,9 @@ def test_a_bundle_that_answers_no_request_is_not_passed_over_without_a_word(
     join(home, bundle)
     home.request.unlink()
     home.answer.write_bytes(bundle.encode())
-    assert take_up(home) is None and "has made no request that this bundle could answer" in caplog.text
+    assert join_with_answer(home) is None and "has made no request that this bundle could answer" in caplog.text
     with pytest.raises(ConfigError, match="run `join --name NAME"):
-        take_up(RobotHome(home.path.parent))
+        join_with_answer(RobotHome(home.path.parent))
 
 
 def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_crash_fell(
@@ -356,6 +364,6 @@ def test_after_joining_again_the_readers_are_those_of_the_bundle_wherever_a_cras
         join(home, after)
     assert after.readers.keys() <= {file.stem for file in home.readers.glob("*.pem")}, "nobody is left out"
     home.answer.write_bytes(after.encode())
-    take_up(home)
+    join_with_answer(home)
     assert {file.name for file in home.readers.iterdir()} == {"owner.pem", "stays.pem", "comes.pem", "note.txt"}
     assert "no longer sealed for by_hand, goes" in caplog.text and not home.answer.exists()

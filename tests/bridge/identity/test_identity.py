@@ -83,7 +83,6 @@ def _certificates(ca: ids.CertificateAuthority, **changes) -> tuple[bytes, bytes
             "not_before": BIRTH,
             "not_after": BIRTH + timedelta(days=100),
             "key_usage": usage,
-            "extended_key_usage": ("clientAuth",),
             "subject_alt_names": ("URI:urn:rosbridge-eth:robot:robot_1",),
         } | changes
         made.append(x509.issue(request, ca.certificate, ca.key, **options).to_der())
@@ -96,9 +95,7 @@ UNTRUSTED = {
     "both for encryption": lambda: _certificates(CA, key_usage=ids.ENCRYPTION_USAGE),
     "both for everything": lambda: _certificates(CA, key_usage=ids.SIGNING_USAGE + ids.ENCRYPTION_USAGE),
     "for servers": lambda: _certificates(CA, extended_key_usage=("serverAuth",)),
-    "a robot that calls itself a server": lambda: _certificates(
-        CA, subject_alt_names=("URI:urn:rosbridge-eth:server:robot_1",)
-    ),
+    "no log's signer": lambda: _certificates(CA, key_usage=("digitalSignature",)),
     "no name": lambda: _certificates(CA, subject_alt_names=("DNS:robot_1",)),
     "two names": lambda: _certificates(
         CA, subject_alt_names=("URI:urn:rosbridge-eth:robot:robot_1", "URI:urn:rosbridge-eth:robot:robot_2")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from rosbridge_eth import identity
-from rosbridge_eth.log.chunk import Chunk, Header, Log, ledger_id, proofs, robot_id, seal
+from rosbridge_eth.log.chunk import Chunk, Header, Log, _body_key, ledger_id, proofs, robot_id, seal
 from smcrypto import sm2, sm3, sm4
 
 LOG = Log(ledger_id(1337, b"g" * 32, b"c" * 20), robot_id("robot_1"))
@@ -25,7 +25,7 @@ def sealed(lines: Sequence[bytes] = LINES, **changes: Any) -> Chunk:
     """A chunk as the robot makes it, for READER."""
     given: dict[str, Any] = {
         "stream": STREAM, "number": 3, "previous": b"p" * 32, "sealed_ms": 1_795_226_223_026,
-        "readers": [READER.public_key],
+        "readers": [READER.public_key], "secret": b"s" * 32,
     }  # fmt: skip
     return seal(LOG, ROBOT, lines, **given | changes)
 
@@ -48,11 +48,10 @@ def lying(frame: bytes, *, records: int = 1, root: bytes = b"r" * 32, pad: int |
     """A chunk that the robot signed, and whose body holds `frame` and whatever the robot likes."""
     plaintext = frame + bytes(-len(frame) % 64 if pad is None else pad)
     place = STREAM + (3).to_bytes(8, "big")
-    body = sm4.SM4GCM(sealed_under or key).encrypt(bytes(12), plaintext, LOG.ledger + LOG.tk + place)
-    tag = sm3.digest(place + READER.public_key.to_bytes())[:8]
+    body = sm4.SM4GCM(_body_key(sealed_under or key)).encrypt(bytes(12), plaintext, LOG.ledger + LOG.tk + place)
     header = struct.pack(
-        FIXED, 2, flags, STREAM, 3, bytes(32), 5, records, root, len(body), sm3.digest(body), 1
-    ) + tag + READER.public_key.encrypt(key, encoding="c1c3c2")  # fmt: skip
+        FIXED, 3, flags, STREAM, 3, bytes(32), 5, records, root, len(body), sm3.digest(body), 1
+    ) + READER.public_key.encrypt(key, encoding="c1c3c2")  # fmt: skip
     return signed(header, body)
 
 

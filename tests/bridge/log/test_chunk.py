@@ -43,10 +43,12 @@ from rosbridge_eth.log.chunk import (
     TooLarge,
     Unopenable,
     content_key,
+    content_secret,
     drop,
     ledger_id,
     open_lines,
     robot_id,
+    unwrap,
     verify,
     zstd,
 )
@@ -223,7 +225,7 @@ def test_a_body_of_another_chunk_is_altered():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"version": 1}, {"version": 3}, {"flags": 4}, {"flags": 0x81}, {"n": 0}, {"n": 2}, {"n": 17},
+        {"version": 2}, {"version": 4}, {"flags": 4}, {"flags": 0x81}, {"n": 0}, {"n": 2}, {"n": 17},
         {"records": 0}, {"records": MAX_RECORDS + 1}, {"records": 2**32 - 1}, {"sealed_ms": chunks.MAX_TIME_MS},
         {"body_length": 0}, {"body_length": 16}, {"body_length": 64}, {"body_length": 81},
         {"body_length": MAX_BODY + 16}, {"body_length": MAX_BODY + 64}, {"body_length": 2**32 - 1},
@@ -244,13 +246,13 @@ def test_a_header_that_cannot_be_is_malformed(changes):
 def test_a_chunk_without_records_has_nothing_else(changes):
     with pytest.raises(Malformed):
         Header.parse(header_bytes(EMPTY.header, **changes))
-    grant = CHUNK.header.encoded[-121:]
+    grant = CHUNK.header.encoded[-113:]
     with pytest.raises(Malformed):
         Header.parse(header_bytes(EMPTY.header, n=1) + grant)
 
 
 def test_one_to_sixteen_grants_are_a_header_and_others_are_not():
-    grant = CHUNK.header.encoded[-121:]
+    grant = CHUNK.header.encoded[-113:]
     assert len(Header.parse(header_bytes(CHUNK.header, n=16) + 15 * grant).grants) == 16
     with pytest.raises(Malformed):
         Header.parse(header_bytes(CHUNK.header, n=17) + 16 * grant)
@@ -324,22 +326,44 @@ def test_a_zip_bomb_is_unopenable_and_costs_no_memory():
     assert len(opened(lying(fits, root=root_of([b"a" * (MAX_PLAINTEXT - 1)])))[0]) == MAX_PLAINTEXT - 1
 
 
-def test_a_grant_that_holds_no_key_is_unopenable_and_a_second_one_is_tried():
-    junk = CHUNK.header.encoded[-121:-113] + b"\4" + bytes(112)
-    good = CHUNK.header.encoded[-121:]
-    fixed = header_bytes(CHUNK.header)[:139]
-    with pytest.raises(Unopenable):
-        content_key(Header.parse(fixed + junk), READER)
-    two = Header.parse(fixed[:-1] + b"\2" + junk + good)
-    assert content_key(two, READER) == content_key(CHUNK.header, READER)
-    elsewhere = sealed(number=9, readers=[SECOND.public_key])
+def test_the_grant_that_fits_is_found_wherever_it_stands_and_the_likely_one_is_tried_first(monkeypatch):
+    junk, good = b"\4" + bytes(112), CHUNK.header.encoded[-113:]
+    fixed = header_bytes(CHUNK.header)[:138]
+    key = content_key(CHUNK.header, READER)
+    tried = []
+    decrypt = sm2.PrivateKey.decrypt
+
+    def trying(self, grant, *, encoding):
+        tried.append(grant)
+        return decrypt(self, grant, encoding=encoding)
+
+    monkeypatch.setattr(sm2.PrivateKey, "decrypt", trying)
+    for place in range(3):
+        grants = [junk] * place + [good] + [junk] * (2 - place)
+        header = Header.parse(fixed + b"\3" + b"".join(grants))
+        for likely in range(4):
+            tried.clear()
+            assert unwrap(header, READER, likely) == (key, place)
+            assert len(tried) == 1 if likely == place else len(tried) <= place + 2
     with pytest.raises(NoGrant):
-        content_key(elsewhere.header, READER)
+        content_key(Header.parse(fixed + b"\1" + junk), READER)
+    with pytest.raises(NoGrant):
+        content_key(sealed(number=9, readers=[SECOND.public_key]).header, READER)
 
 
-def test_a_reader_looks_the_same_to_nobody_in_two_chunks():
-    tags = {sealed(number=n, stream=stream).header.grants[0][0] for n in (0, 1) for stream in (STREAM, b"s" * 16)}
-    assert len(tags) == 4
+def test_grants_say_nothing_of_whom_they_are_for():
+    points = {sealed(number=n).header.grants[0][:65] for n in (0, 0, 1, 1)}
+    assert len(points) == 4
+
+
+def test_a_wrapped_key_that_was_copied_to_another_chunk_opens_nothing_there():
+    """The wrap names no place; the associated data of the body does."""
+    other = sealed(number=4)
+    copied = header_bytes(other)[:138] + b"\1" + CHUNK.header.grants[0]
+    for header in (copied, header_bytes(CHUNK.header, number=4)):
+        chunk = signed(header, CHUNK.body if header != copied else other.body)
+        with pytest.raises(Unopenable):
+            opened(chunk)
 
 
 def test_a_key_handed_over_opens_this_chunk_and_no_other():
@@ -370,20 +394,35 @@ def test_two_forks_with_the_same_random_bytes_never_encrypt_two_contents_under_o
 
 
 def test_another_robot_log_or_randomness_is_another_key():
-    def key(log: Log, robot: sm2.PrivateKey, random: bytes) -> bytes:
+    def key(log: Log, random: bytes, secret: bytes | None = b"s" * 32) -> bytes:
         chunk = chunks.seal(
-            log, robot, LINES, stream=STREAM, number=0, previous=bytes(32), sealed_ms=0,
-            readers=[READER.public_key], randomness=lambda size: random,
+            log, ROBOT, LINES, stream=STREAM, number=0, previous=bytes(32), sealed_ms=0,
+            readers=[READER.public_key], secret=secret, randomness=lambda size: random,
         )  # fmt: skip
         return content_key(chunk.header, READER)
 
-    usual = key(LOG, ROBOT, bytes(32))
-    assert usual == key(LOG, ROBOT, bytes(32))
+    usual = key(LOG, bytes(32))
+    assert usual == key(LOG, bytes(32))
     others = {
-        key(Log(b"x" * 32, LOG.tk), ROBOT, bytes(32)), key(Log(LOG.ledger, b"x" * 32), ROBOT, bytes(32)),
-        key(LOG, STRANGER, bytes(32)), key(LOG, ROBOT, b"\1" * 32), usual,
+        key(Log(b"x" * 32, LOG.tk), bytes(32)), key(Log(LOG.ledger, b"x" * 32), bytes(32)),
+        key(LOG, bytes(32), b"t" * 32), key(LOG, bytes(32), None), key(LOG, b"\1" * 32), usual,
     }  # fmt: skip
-    assert len(others) == 5
+    assert len(others) == 6
+
+
+def test_the_secret_of_a_run_needs_no_more_of_the_key_than_a_signature(monkeypatch):
+    class Token:
+        """A key that only signs."""
+
+        def sign(self, message: bytes, *, encoding: str) -> bytes:
+            return ROBOT.sign(message, encoding=encoding)
+
+    made = chunks.seal(LOG, Token(), LINES, stream=STREAM, number=0, previous=bytes(32), sealed_ms=0,
+                       readers=[READER.public_key])  # fmt: skip
+    assert opened(made) == LINES
+    monkeypatch.setattr("smcrypto.sm2.nonces.hedged_nonces.__kwdefaults__", {"entropy": bytes})
+    assert content_secret(ROBOT) == content_secret(ROBOT)  # without any randomness, it is the key's alone
+    assert len({content_secret(ROBOT), content_secret(STRANGER)}) == 2
 
 
 def test_reprs_show_neither_content_nor_keys():

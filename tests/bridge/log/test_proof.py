@@ -13,10 +13,11 @@ from rosbridge_eth.log.chunk import MAX_RECORDS, Altered, Proof, check_proof, co
 from smcrypto import sm3
 
 KEY = b"k" * 16
+SALT_KEY = sm3.hmac(KEY, b"rosbridge-eth/3 salts\1")
 
 
 def leaf(i: int, line: bytes) -> bytes:
-    return sm3.digest(b"\0" + sm3.hmac(KEY, i.to_bytes(4, "big"))[:16] + line)
+    return sm3.digest(b"\0" + sm3.hmac(SALT_KEY, i.to_bytes(4, "big"))[:16] + line)
 
 
 def split(n: int) -> int:
@@ -54,7 +55,7 @@ def test_every_record_of_every_small_chunk_is_proven_as_the_rfc_says(n):
     root = tree_hash(leaves)
     for i, line in enumerate(lines):
         proof = next(proofs(lines, KEY, [i]))
-        assert proof == Proof(i, sm3.hmac(KEY, i.to_bytes(4, "big"))[:16], tuple(path(i, leaves)))
+        assert proof == Proof(i, sm3.hmac(SALT_KEY, i.to_bytes(4, "big"))[:16], tuple(path(i, leaves)))
         check_proof(root, n, line, proof)
         for j in range(-1, n + 2) if n < 20 else ():
             if j != i:
@@ -66,8 +67,9 @@ def test_the_root_in_a_header_is_the_rfc_s_over_the_chunk_s_lines():
     for lines in ([], LINES, [b"x"] * MAX_RECORDS):
         header = sealed(lines).header
         key = content_key(header, READER) if lines else b""
+        salt_key = sm3.hmac(key, b"rosbridge-eth/3 salts\1")
         leaves = [
-            sm3.digest(b"\0" + sm3.hmac(key, i.to_bytes(4, "big"))[:16] + line) for i, line in enumerate(lines)
+            sm3.digest(b"\0" + sm3.hmac(salt_key, i.to_bytes(4, "big"))[:16] + line) for i, line in enumerate(lines)
         ]
         assert header.root == tree_hash(leaves)
 

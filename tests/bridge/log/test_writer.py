@@ -340,6 +340,7 @@ def test_two_starts_with_one_random_source_never_share_a_key():
     keys = set()
     for i in range(2):
         made = writer(randomness=lambda size: bytes(size))
+        made._secret = bytes(32)
         made.add(message(i), 0.0)
         keys.add(content_key(made.finish(0)[0].header, READER))
     assert len(keys) == 2

@@ -271,7 +271,7 @@ def test_a_robot_without_a_trigger_is_not_ended_by_the_signal(robot: RobotHome, 
         eventually(lambda: "Ctrl-C ends it" in (tmp_path / "log").read_text(), "it runs")
         process.send_signal(signal.SIGUSR1)
         process.send_signal(signal.SIGHUP)
-        eventually(lambda: "taken up" in (tmp_path / "log").read_text(), "it goes on")
+        eventually(lambda: "reloaded" in (tmp_path / "log").read_text(), "it goes on")
 
 
 @pytest.mark.service

@@ -427,7 +427,7 @@ def test_a_registration_that_the_contract_does_not_have_is_found(
 ):
     place.ledger.revoke_robot(keys.operator, robot_id("robot_1"))
     _, findings = doctor(capsys)
-    assert "register robot_1 REQUEST --replace" in of(findings, "registration")["mend"]
+    assert "register robot_1 REQUEST --replace" in of(findings, "registration")["found"]
 
 
 def test_a_contract_of_another_operator_and_an_empty_treasury_are_found(place: Place, capsys: Capture, monkeypatch):

@@ -1,4 +1,4 @@
-"""SIGHUP at a robot: topics and readers are taken up without losing a message; without its terminal it ends."""
+"""SIGHUP at a robot: topics and readers are reloaded without losing a message; without its terminal it ends."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def robot(tmp_path: Path) -> RobotHome:
 
 
 @pytest.mark.service
-def test_topics_and_readers_are_taken_up_and_no_message_is_lost(
+def test_topics_and_readers_are_reloaded_and_no_message_is_lost(
     robot: RobotHome, require: Callable[[str], str], tmp_path: Path
 ):
     require("rosmaster")
@@ -48,17 +48,18 @@ def test_topics_and_readers_are_taken_up_and_no_message_is_lost(
         eventually(lambda: graph.subscribers("/kept") and robot.spool.exists(), "it listens")
         robot.config.write_text("topics = [")
         process.send_signal(signal.SIGHUP)
-        eventually(lambda: said("nothing is taken up"), "a file that does not parse is told")
+        eventually(lambda: said("nothing is reloaded"), "a file that does not parse is told")
         assert graph.subscribers("/new") == [] and process.poll() is None
         (robot.readers / "late.pem").write_bytes(LATE.public.pem)
         robot.config.write_text(f'topics = ["/kept", "/new"]\nserver = "192.0.2.1:9"\n{source}')
         process.send_signal(signal.SIGHUP)
-        eventually(lambda: graph.subscribers("/new") and not graph.subscribers("/left"), "the topics are taken up")
-        assert said("taken up: topics, nodes, trigger, capture, readers; ") and said("from the next start on: server\n")
+        eventually(lambda: graph.subscribers("/new") and not graph.subscribers("/left"), "the topics are reloaded")
+        assert said("reloaded: topics, nodes, trigger, capture, readers; ")
+        assert said("not before the next start: server\n")
         assert arm.stdout is not None and arm.stdout.readline() == "done\n"
         (robot.readers / "owner.pem").unlink()
         process.send_signal(signal.SIGHUP)
-        eventually(lambda: log.read_text().count("taken up: topics") == 2, "a reader is removed")
+        eventually(lambda: log.read_text().count("reloaded: topics") == 2, "a reader is removed")
         process.send_signal(signal.SIGTERM)
         assert process.wait(30) == 0, log.read_text()
     finally:
@@ -86,7 +87,7 @@ def test_a_robot_whose_terminal_is_gone_ends_in_good_order(robot: RobotHome):
     while b"Ctrl-C ends it" not in said:
         said += os.read(terminal, 1 << 16)
     os.kill(pid, signal.SIGHUP)
-    while b"taken up: capture, readers" not in said:
+    while b"reloaded: capture, readers" not in said:
         said += os.read(terminal, 1 << 16)
     os.close(terminal)
     _, status = os.waitpid(pid, 0)

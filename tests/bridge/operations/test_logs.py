@@ -41,7 +41,7 @@ def test_json_has_time_level_part_process_and_event():
     log.info("%s: chunk %d stored", "robot robot_1", 7)
     event = json.loads(stream.getvalue())
     assert event["event"] == "robot robot_1: chunk 7 stored"
-    assert (event["level"], event["part"], event["process"]) == ("info", "server", "MainProcess")
+    assert (event["level"], event["part"], event["process"]) == ("info", "server.reception", "MainProcess")
     assert event["time"].endswith("Z") and speaks_json()
 
 
@@ -114,6 +114,6 @@ def test_trouble_is_said_at_each_change_and_so_is_its_end():
     for why in (None, None, "no answer", "no answer", "too slow", None, None, "no answer", None):
         trouble.now(why)
         assert trouble.why == why
-    said = [line.partition("server: ")[2] for line in stream.getvalue().splitlines()]
+    said = [line.partition("server.reception: ")[2] for line in stream.getvalue().splitlines()]
     assert said == ["the node: no answer", "the node: too slow", "the node: well again", "the node: no answer",
                     "the node: well again"]  # fmt: skip

@@ -257,7 +257,7 @@ def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bri
     bridge.until("ready again", bridge.ready)
 
 
-def test_sighup_takes_up_server_toml_and_the_robots_go_on(bridge: Bridge):
+def test_sighup_reloads_server_toml_and_the_robots_go_on(bridge: Bridge):
     assert bridge.server is not None
     bridge.until("ready at first", bridge.ready)
     robot = bridge.start_robot('kind = "sim"')
@@ -267,12 +267,12 @@ def test_sighup_takes_up_server_toml_and_the_robots_go_on(bridge: Bridge):
     try:
         config.write_text(good.replace("[chain]", "[chain]\nconfirmations = 0"))
         bridge.server.send_signal(signal.SIGHUP)
-        bridge.until("refused", lambda: bridge.said("server.log", "nothing is taken up") == 1)
+        bridge.until("refused", lambda: bridge.said("server.log", "nothing is reloaded") == 1)
         assert bridge.figures()["starts"] == before
         config.write_text(good.replace("[chain]", "workers = 3\n[chain]\nconfirmations = 2"))
         bridge.server.send_signal(signal.SIGHUP)
-        bridge.until("taken up", lambda: bridge.said("server.log", "taken up: channel, chain,") == 1)
-        assert bridge.said("server.log", "holds from the next start on: workers") == 1
+        bridge.until("reloaded", lambda: bridge.said("server.log", "reloaded: channel, chain,") == 1)
+        assert bridge.said("server.log", "not before the next start: workers") == 1
         bridge.until("other processes", lambda: bridge.figures()["starts"] == before + 3)
         bridge.until("ready", bridge.ready)
         bridge.until("the session again", lambda: bridge.figures()["channel connections"] == 1)
@@ -284,7 +284,7 @@ def test_sighup_takes_up_server_toml_and_the_robots_go_on(bridge: Bridge):
         robot.terminate()
         bridge.server.send_signal(signal.SIGHUP)
     assert robot.wait(30) == 0
-    bridge.until("as before", lambda: bridge.said("server.log", "taken up: channel, chain,") == 2)
+    bridge.until("as before", lambda: bridge.said("server.log", "reloaded: channel, chain,") == 2)
     bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
     verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
     assert verdict["sound"] and verdict["head"]["goodbye"]

@@ -16,16 +16,20 @@ import pytest
 
 from bridge.chunks import chain as chunk_chain
 from bridge.chunks import dropped
-from bridge.operations.conftest import NODE_SECRETS, PASSWORD, Place
+from bridge.operations.conftest import NODE_SECRETS, PASSPHRASE, PASSWORD, Place
 from bridge.redis_server import RedisServer
 from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config, load_server_config
-from rosbridge_eth.errors import BridgeError, ExitCode
+from rosbridge_eth.config.home import RobotHome
+from rosbridge_eth.errors import BridgeError, ChainError, ExitCode
+from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.operator import doctor
+from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator import status as module
+from rosbridge_eth.operator.bundle import ask_to_join
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.operator.status import span
 from rosbridge_eth.robot.loop import open_robot
@@ -157,6 +161,87 @@ def test_how_long_an_account_lasts_is_what_it_spent_of_late(
     write(chunks[2])
     monkeypatch.setattr(module, "SPENDING_BLOCKS", 0)
     assert status(capsys)["robots"]["robot_1"]["days_left"] is None, "nothing was spent: nothing is known"
+
+
+def test_a_node_without_old_states_is_told_in_a_sentence_of_ours(
+    place: Place, on_chain: None, monkeypatch: Patch, capsys: Capture
+):
+    """As after a restored backup of a home with its local chain: anvil has no block from before its start."""
+    standings = Ledger.standings
+
+    def forgetful(ledger: Ledger, tks: Any, block: int | str = "latest") -> Any:
+        if block != "latest":
+            raise ChainError("BlockOutOfRangeError: block height is 12 but requested was 1")
+        return standings(ledger, tks, block)
+
+    monkeypatch.setattr(Ledger, "standings", forgetful)
+    report = status(capsys)
+    [said] = [line for line in report["unknown"] if "accounts last" in line]
+    assert "does not have the balances of block" in said and "OutOfRange" not in said
+    assert report["robots"]["robot_1"]["eth"] > 0 and report["robots"]["robot_1"]["days_left"] is None
+
+
+def register_again(place: Place, keys: Keyring) -> None:
+    second = RobotHome(place.path / "second")
+    admin.register_robot(
+        place.operator, "robot_1", ca=load_ca(place.operator.ca, PASSPHRASE, datetime.now(UTC)), keys=keys,
+        ledger=place.ledger, inbox=place.inbox, now=datetime.now(UTC), pause=lambda seconds: None, replace=True,
+        request=ask_to_join(second, "robot_1", PASSWORD),
+    )  # fmt: skip
+
+
+def test_a_robot_that_was_revoked_after_the_registrys_backup_is_told_and_not_in_force(
+    place: Place, on_chain: None, keys: Keyring, capsys: Capture
+):
+    assert status(capsys)["differences"] == {}
+    place.ledger.revoke_robot(keys.operator, TK)
+    report = status(capsys)
+    assert report["robots"]["robot_1"]["in_force"] is False
+    [alarm] = report["alarms"]
+    assert "robot_1: it was revoked on the chain" in alarm and "run `revoke robot_1`" in alarm
+    assert run(["revoke", "robot_1", "--passphrase-file", "pass"]) == ExitCode.OK
+    capsys.readouterr()
+    assert status(capsys)["alarms"] == []
+
+
+def test_a_robot_that_was_replaced_after_the_registrys_backup_is_told(
+    place: Place, on_chain: None, keys: Keyring, capsys: Capture
+):
+    old = place.operator.registry.read_bytes()
+    register_again(place, keys)
+    assert status(capsys)["alarms"] == []
+    place.operator.registry.write_bytes(old)
+    [alarm] = status(capsys)["alarms"]
+    assert "certificates that this registry does not know" in alarm and "restore a newer registry.sqlite" in alarm
+
+
+def test_a_node_that_is_behind_a_registration_is_told_as_such(
+    place: Place, on_chain: None, keys: Keyring, capsys: Capture
+):
+    before = place.chain.ethereum_tester.take_snapshot()
+    register_again(place, keys)
+    place.chain.ethereum_tester.revert_to_snapshot(before)
+    [alarm] = status(capsys)["alarms"]
+    assert alarm == (
+        "ALARM: robot_1: the node does not have its registration yet: wait until the node has caught up"
+    )
+
+
+def test_no_address_is_broken_at_80_columns(place: Place, monkeypatch: Patch, capsys: Capture):
+    monkeypatch.setenv("COLUMNS", "80")
+    source = "[2001:db8:1234:5678:9abc:def0:1234:5678]:54321"
+    with metrics.shared(place.operator.path):
+        for process in ("worker-0", "submitter"):
+            metrics.STARTS.labels(process).set(1)
+            metrics.beat(process, time.time())
+        metrics.SESSION.labels("robot_1", source).set(time.time())
+        assert run(["status"]) == 0
+    shown = capsys.readouterr().out
+    contract = place.operator.deployment().contract
+    for address in (source, contract, place.operator.account):
+        assert address in shown
+    assert run(["status", "--home", "robot"]) == 0
+    assert contract in capsys.readouterr().out
 
 
 def test_what_is_on_hold_or_dead_is_told_with_the_reason(place: Place, capsys: Capture):

@@ -138,7 +138,7 @@ def test_workers_that_were_given_at_the_start_are_no_change_of_the_file(place: P
     server = Supervisor(place.operator, load_server_config(place.operator.config), secrets, workers=3)
     server._check = lambda config: None  # type: ignore[method-assign]
     server._read_again({})
-    assert "taken up" in caplog.text and "next start" not in caplog.text
+    assert "reloaded" in caplog.text and "next start" not in caplog.text
 
 
 def test_workers_are_named_by_their_numbers():

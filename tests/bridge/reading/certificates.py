@@ -7,7 +7,7 @@ from datetime import timedelta
 from typing import Any, NamedTuple
 
 from bridge.reading.world import NAME, START, authority
-from rosbridge_eth.identity import ENCRYPTION_USAGE, CertificateAuthority, Identity, Role, create_ca
+from rosbridge_eth.identity import ENCRYPTION_USAGE, SIGNING_USAGE, CertificateAuthority, Identity, Role, create_ca
 from smcrypto import der, sm2, x509
 from smcrypto.x509 import extensions as ext
 
@@ -33,7 +33,7 @@ CAS = [authority(), ca_with(1), ca_with(None), ca_with(0, extended_key_usage=("c
 
 def certificate(
     key: sm2.PrivateKey, usage: Sequence[str], *, ca: CertificateAuthority | None = None, basic: bool | None = False,
-    purposes: Sequence[str] = ("clientAuth",), names: Sequence[str] = (URI,), further: Sequence[ext.Extension] = (),
+    purposes: Sequence[str] = (), names: Sequence[str] = (URI,), further: Sequence[ext.Extension] = (),
 ) -> x509.Certificate:  # fmt: skip
     """basic: cA; None: without basicConstraints."""
     ca = ca or authority()
@@ -67,29 +67,31 @@ def cases() -> Iterator[Case]:
     critical, other = (ext.Extension(UNKNOWN, wrong, b"\5\0") for wrong in (True, False))
     policies = ext.Extension(ext.CERTIFICATE_POLICIES, True, bytes.fromhex("30083006060455 1d2000"))
     stranger = create_ca("Test CA", at=START)  # of the same name as the CA, with another key
-    signing, encryption = ("digitalSignature",), ENCRYPTION_USAGE
+    signing, encryption = SIGNING_USAGE, ENCRYPTION_USAGE
     for name, good, both, first, second in (
         ("as enrolled", True, {}, {}, {}),
-        ("as fleet-ca.md has it", True, {}, {"usage": ("digitalSignature", "nonRepudiation")}, {}),
-        ("also for servers", True, {"purposes": ("serverAuth", "clientAuth")}, {}, {}),
+        ("also for lists", True, {}, {"usage": (*SIGNING_USAGE, "cRLSign")}, {}),
         ("an extension that nobody knows", True, {"further": [other]}, {}, {}),
         ("keyAgreement alone", True, {}, {}, {"usage": ("keyAgreement",)}),
         ("basicConstraints absent", True, {"basic": None}, {}, {}),
         ("pathLen 1 of the CA", True, {"ca": CAS[1]}, {}, {}),
         ("no pathLen of the CA", True, {"ca": CAS[2]}, {}, {}),
         ("the CA for clientAuth", True, {"ca": CAS[3]}, {}, {}),
-        ("the CA for serverAuth", False, {"ca": CAS[4]}, {}, {}),
+        ("the CA for serverAuth", True, {"ca": CAS[4]}, {}, {}),
         ("name constraints of the CA", False, {"ca": CAS[5]}, {}, {}),
         ("critical policies", True, {"further": [policies]}, {}, {}),
-        ("extendedKeyUsage absent", False, {"purposes": ()}, {}, {}),
-        ("extendedKeyUsage of the second absent", False, {}, {}, {"purposes": ()}),
+        ("for TLS clients", False, {"purposes": ("clientAuth",)}, {}, {}),
+        ("the second for TLS clients", False, {}, {}, {"purposes": ("clientAuth",)}),
+        ("as before version 3", False, {"purposes": ("clientAuth",)}, {"usage": ("digitalSignature",)}, {}),
+        ("no nonRepudiation", False, {}, {"usage": ("digitalSignature",)}, {}),
+        ("encryption with nonRepudiation", False, {}, {}, {"usage": ("nonRepudiation", "keyAgreement")}),
         ("any extendedKeyUsage", False, {"purposes": ("anyExtendedKeyUsage",)}, {}, {}),
         ("for servers", False, {"purposes": ("serverAuth",)}, {}, {}),
         ("cA TRUE", False, {"basic": True}, {}, {}),
         ("cA TRUE of the second", False, {}, {}, {"basic": True}),
         ("keyUsage absent", False, {}, {"usage": ()}, {}),
         ("keyUsage of the second absent", False, {}, {}, {"usage": ()}),
-        ("signing with keyAgreement", False, {}, {"usage": ("digitalSignature", "keyAgreement")}, {}),
+        ("signing with keyAgreement", False, {}, {"usage": (*SIGNING_USAGE, "keyAgreement")}, {}),
         ("no digitalSignature", False, {}, {"usage": ("nonRepudiation",)}, {}),
         ("no keyAgreement", False, {}, {}, {"usage": ("keyEncipherment", "dataEncipherment")}),
         ("encryption with digitalSignature", False, {}, {}, {"usage": ("digitalSignature", "keyAgreement")}),

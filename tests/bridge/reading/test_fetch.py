@@ -38,7 +38,7 @@ class Chain:
     def read(self, *others: Any, ledgers: Sequence[Any] | None = None, **more: Any) -> Reading:
         return read_robot(
             ledgers or [self.ledger, *others], NAME, trust=Trust([authority().certificate]),
-            reader=reader().encryption_key, now=NOW, **more,
+            reader=reader().encryption_key, **({"now": NOW} | more),
         )  # fmt: skip
 
 
@@ -306,6 +306,37 @@ def test_nodes_of_two_chains_are_refused(chain):
     stranger.ledger = b"z" * 32
     with pytest.raises(ConfigError, match="not of one chain"):
         chain.read(stranger)
+
+
+@pytest.mark.parametrize("behind", [1, 2, 50])
+def test_one_node_that_is_behind_what_was_read_before_is_no_roll_back(chain, tmp_path: Path, behind):
+    """Its newest block is older than the one that was read up to: read again when it has caught up."""
+    tester, bookmarks = chain.where.ethereum_tester, Bookmarks(tmp_path / "bookmarks.json")
+    chain.write(chain.pen.chunks(2))
+    old = tester.take_snapshot()
+    chain.write(chain.pen.chunks(1))
+    tester.mine_blocks(behind - 1)
+    now = chain.ledger.block().time + 5.0
+    first = chain.read(bookmarks=bookmarks, now=now)
+    assert numbers(first) == [0, 1, 2]
+    first.keep(bookmarks)
+    tester.revert_to_snapshot(old)
+    with pytest.raises(ChainError, match=r"is behind: its block .* wait until it has caught up"):
+        chain.read(bookmarks=bookmarks, now=now)
+    tester.time_travel(int(now) + 60)
+    tester.mine_blocks(1)
+    again = chain.read(bookmarks=bookmarks, now=now + 60)
+    assert numbers(again) == [0, 1] and violations(again) == ["rolled-back"], "newer blocks without the chunk"
+
+
+def test_a_node_that_claims_a_block_of_tomorrow_makes_no_later_node_look_behind(chain, tmp_path: Path):
+    bookmarks = Bookmarks(tmp_path / "bookmarks.json")
+    chain.write(chain.pen.chunks(1))
+    first = chain.read(bookmarks=bookmarks)  # NOW is long before the chain's time
+    numbers(first)
+    first.keep(bookmarks)
+    mark = bookmarks.get(chain.pen.log)
+    assert mark is not None and mark.time == NOW < chain.ledger.block().time
 
 
 def test_a_bookmark_is_not_moved_by_a_node_that_rolled_back(chain, tmp_path: Path):

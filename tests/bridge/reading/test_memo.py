@@ -97,7 +97,7 @@ def proven(monkeypatch) -> list[str]:
         monkeypatch.setattr(verify, name, lambda *given: done.append(name) or real(*given))
 
     counting("verify_signature")
-    counting("content_key")
+    counting("unwrap")
     return done
 
 

@@ -418,8 +418,7 @@ def test_without_a_key_everything_but_the_content_is_checked():
     assert [kind for kind, *_ in read([chunks[0], chunks[2]], keyless=True).found] == ["no-grant", "missing"]
 
 
-def test_a_key_that_the_robot_wrapped_wrongly(monkeypatch):
-    """Its tag says that it is for this reader; what is wrapped is for another."""
+def test_a_key_that_the_robot_wrapped_wrongly_is_none_for_this_reader(monkeypatch):
     pen = Pen()
     other = reader("insurer").encryption_key.public_key
     key = type(other)
@@ -428,8 +427,24 @@ def test_a_key_that_the_robot_wrapped_wrongly(monkeypatch):
     chunk = pen.write(message(1))
     monkeypatch.undo()
     result = read([chunk, *Pen(number=1, previous=pen.previous, sealed_ms=pen.sealed_ms).chunks(1)])
-    assert result.only(Kind.UNOPENABLE).places[0][0] == 0
+    assert result.only(Kind.NO_GRANT).places[0][0] == 0
     assert result.numbers == [1]
+
+
+def test_a_reader_who_comes_behind_others_tries_all_grants_once(monkeypatch):
+    from rosbridge_eth.reading import verify
+
+    asked = []
+    unwrap = verify.unwrap
+
+    def asking(header, key, likely):
+        asked.append(likely)
+        return unwrap(header, key, likely)
+
+    monkeypatch.setattr(verify, "unwrap", asking)
+    pen = Pen(readers=[reader("insurer"), reader()])
+    assert read(pen.chunks(3)).verdict.sound
+    assert asked == [0, 1, 1]
 
 
 def test_a_root_that_is_not_the_records(monkeypatch):

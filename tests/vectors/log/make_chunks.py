@@ -36,8 +36,9 @@ READERS = [sm2.PrivateKey.from_bytes(b"\0" + drawn(f"reader {i}", 31)) for i in 
 NAME, CHAIN_ID = "robot_1", 1337
 GENESIS, CONTRACT = drawn("genesis", 32), drawn("contract", 20)
 LOG = Log(chunks.ledger_id(CHAIN_ID, GENESIS, CONTRACT), chunks.robot_id(NAME))
-STREAMS = [drawn(f"stream {i}", 16) for i in range(2)]
 SEALED_MS = 1_795_226_223_026
+STREAMS = [chunks.stream_name(SEALED_MS + i * 60_000, bytes(16), lambda size: drawn("stream", size)) for i in range(2)]
+SECRET = chunks.content_secret(ROBOT)
 
 STREAM_LINE = b'{"stream":{"source":"sim","software":"rosbridge_eth 2.0"}}'
 TYPE_LINE = (
@@ -68,7 +69,7 @@ def make(
         LOG, ROBOT, lines,
         stream=STREAMS[stream], number=number, previous=previous, sealed_ms=SEALED_MS + number * 1000,
         readers=[reader.public_key for reader in READERS[:readers]], goodbye=goodbye, compress=compress,
-        randomness=lambda size: random,
+        secret=SECRET, randomness=lambda size: random,
     )  # fmt: skip
     header = chunk.header
     case: dict[str, Any] = {
@@ -79,12 +80,13 @@ def make(
     if lines:
         key = chunks.content_key(header, READERS[0])
         place = header.stream + number.to_bytes(8, "big")
-        plaintext = sm4.SM4GCM(key).decrypt(bytes(12), chunk.body, LOG.ledger + LOG.tk + place)
+        body_key, salt_key = (sm3.hmac(key, b"rosbridge-eth/3 " + label + b"\1") for label in (b"body", b"salts"))
+        plaintext = sm4.SM4GCM(body_key[:16]).decrypt(bytes(12), chunk.body, LOG.ledger + LOG.tk + place)
         case |= {
             "random": random.hex(), "plaintext": plaintext.hex(), "content_key": key.hex(),
+            "body_key": body_key[:16].hex(), "salt_key": salt_key.hex(),
             "associated_data": (LOG.ledger + LOG.tk + place).hex(),
-            "salts": [sm3.hmac(key, i.to_bytes(4, "big"))[:16].hex() for i in range(len(lines))],
-            "tags": [tag.hex() for tag, _ in header.grants],
+            "salts": [sm3.hmac(salt_key, i.to_bytes(4, "big"))[:16].hex() for i in range(len(lines))],
         }  # fmt: skip
     case |= {
         "root": header.root.hex(), "body_digest": header.body_digest.hex(), "header": header.encoded.hex(),
@@ -117,7 +119,7 @@ def vectors() -> dict[str, Any]:
         "zstd": chunks.zstd.zstd_version,
         "robot": {
             "name": NAME, "signing_key": ROBOT.to_bytes().hex(), "public_key": ROBOT.public_key.to_bytes().hex(),
-            "tk": LOG.tk.hex(), "key_secret": sm3.hmac(ROBOT.to_bytes(), b"rosbridge-eth/2 content key").hex(),
+            "tk": LOG.tk.hex(), "secret": SECRET.hex(),
         },
         "ledger": {
             "chain_id": CHAIN_ID, "genesis": GENESIS.hex(), "contract": CONTRACT.hex(), "ledger": LOG.ledger.hex(),

@@ -11,10 +11,13 @@ import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import ClassVar, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, TypeAlias
 
 from rosbridge_eth.capture import Decoder, NamePattern, RawMessage
 from rosbridge_eth.errors import SourceError
+
+if TYPE_CHECKING:
+    from rosbridge_eth.config import RobotConfig
 
 Emit: TypeAlias = Callable[[RawMessage], None]
 """Takes a message; may block, which slows a bag or a simulation down (a live source drops instead)."""
@@ -93,6 +96,10 @@ class Selection:
         self._nodes = [NamePattern(node) for node in nodes]
         self.names_nodes = bool(self._nodes)
         self.named_topics = tuple(dict.fromkeys(pattern.text for pattern in self._topics if pattern.is_exact))
+
+    @staticmethod
+    def of(config: RobotConfig) -> Selection:
+        return Selection([topic.topic for topic in config.topics], config.nodes)
 
     def wants(self, offer: Offer) -> bool:
         """Whether a topic is watched."""

@@ -9,7 +9,7 @@ import pytest
 from rosbridge_eth.config import RobotConfig, parse_config
 from rosbridge_eth.config.models import Ros1Config
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.robot.sources import open_source
+from rosbridge_eth.robot.sources import Selection, open_source
 from rosbridge_eth.robot.sources.ros1.source import Ros1Source
 
 
@@ -19,7 +19,7 @@ def source(text: str) -> Ros1Config:
 
 
 def test_nothing_more_need_be_said():
-    opened = open_source(source(""), parse_config(RobotConfig, 'topics = ["/a"]', Path("robot.toml")).selection())
+    opened = open_source(source(""), Selection.of(parse_config(RobotConfig, 'topics = ["/a"]', Path("robot.toml"))))
     assert isinstance(opened, Ros1Source)
 
 

@@ -26,7 +26,7 @@ from rosbridge_eth.capture import (
 )
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.robot.sources import open_source
+from rosbridge_eth.robot.sources import Selection, open_source
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(message)s")
 stop = threading.Event()
@@ -57,7 +57,7 @@ def emit(raw: RawMessage) -> None:
 
 
 try:
-    source = open_source(config.source_and_why({})[0], config.selection())
+    source = open_source(config.source_and_why({})[0], Selection.of(config))
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
     say(
         {
