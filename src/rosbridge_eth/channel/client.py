@@ -357,9 +357,11 @@ class Client:
             self._counts["handshakes"] += 1
             when = datetime.fromtimestamp(answer.time_ms / 1000, UTC)
             self._events.append(events.Connected(session.peer, self._cid, when))
-        if newest and answer.data and answer.data != session.state:
+        if newest and answer.data not in (b"", session.state):
             session.state = answer.data
             self._events.append(events.State(answer.data))
+        elif newest and session.state and not answer.data:
+            session.sending.probe()  # nothing had come from here that was long enough for the state
 
     def _end(self, reason: End, now: float) -> None:
         session = self._session
