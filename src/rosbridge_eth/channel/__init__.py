@@ -8,7 +8,7 @@ from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.client import Client
 
 from rosbridge_eth.channel.events import (  # isort: skip
-    ClientConfig, Connected, Disconnected, Drop, End, Event, Full, HandshakeFailed, Message, NotConnected, ServerConfig,
+    ClientConfig, Connected, Disconnected, Drop, End, Event, Full, HandshakeFailed, Message, ServerConfig,
     State, Unresolved,
 )  # fmt: skip
 from rosbridge_eth.channel.handshake import Randomness
@@ -17,6 +17,6 @@ from rosbridge_eth.channel.wire import MAX_STATE, Mode, Reason
 
 __all__ = [
     "MAX_STATE", "Address", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End", "Event", "Full",
-    "HandshakeFailed", "Message", "Mode", "NotConnected", "Randomness", "Reason", "Server", "ServerConfig", "State",
+    "HandshakeFailed", "Message", "Mode", "Randomness", "Reason", "Server", "ServerConfig", "State",
     "Unresolved", "cookie_key",
 ]  # fmt: skip

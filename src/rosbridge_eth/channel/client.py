@@ -9,13 +9,12 @@ from enum import StrEnum
 
 from rosbridge_eth.channel import events, wire
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import CLOSE_CODES, ClientConfig, Drop, End, Event
-from rosbridge_eth.channel.handshake import Agreed, ClientHandshake, HandshakeRefused, Randomness
+from rosbridge_eth.channel.events import ClientConfig, Drop, End, Event, Refused, close_frame, parse_close
+from rosbridge_eth.channel.handshake import Agreed, ClientHandshake, Randomness
 from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
 from rosbridge_eth.channel.transfer import MAX_MESSAGE, NEVER, Sending
-from rosbridge_eth.channel.wire import Answer, Assembly, Frame, Hello, Kind, Malformed, Reason
+from rosbridge_eth.channel.wire import Answer, Assembly, Hello, Kind, Malformed, Reason
 from rosbridge_eth.identity import Identity, Trust
-from smcrypto import InvalidTag
 
 FIRST_RETRY = 0.1  # s until a HELLO is repeated, where no round trip was measured yet
 SHORTEST_RETRY = 0.05
@@ -82,7 +81,7 @@ class _Session:
         return self.seals.seal(self._cid, number, frame)
 
     def close(self, reason: End) -> bytes:
-        return self.seal(self.sending.take_number(), bytes((Frame.CLOSE, CLOSE_CODES.index(reason))))
+        return self.seal(self.sending.take_number(), close_frame(reason))
 
     def probe_at(self) -> float:
         """When to ask for the server's state; never while an acknowledgement is due, which has it."""
@@ -143,14 +142,12 @@ class Client:
     def send(self, message: bytes) -> None:
         """Send a message of 0 to MAX_MESSAGE bytes; they arrive in order, each once, while this session lasts.
 
-        Raises NotConnected, or Full where the message is longer than `room` says.
+        Raises Full where the message is longer than `room` says, or there is no session.
         """
-        if self._session is None or not self.connected:
-            raise events.NotConnected("there is no session; wait until it is connected")
         if len(message) > MAX_MESSAGE:
             raise ValueError(f"a message is at most {MAX_MESSAGE} bytes, not {len(message)}")
-        if len(message) > self.room():
-            raise events.Full("no room for another message until some of what was sent is acknowledged")
+        if self._session is None or not self.connected or len(message) > self.room():
+            raise events.Full("no session, or no room until some of what was sent is acknowledged")
         self._session.sending.write(message)
         self._session.interval = PROBE_FIRST
         self._counts["messages_sent"] += 1
@@ -180,13 +177,15 @@ class Client:
         self._counts["bytes_received"] += len(data)
         try:
             if address != self._address:
-                self._counts[Drop.ADDRESS] += 1
-            elif data and data[0] == Kind.DATA:
+                raise Refused(Drop.ADDRESS)
+            if data and data[0] == Kind.DATA:
                 self._on_data(data, now)
             else:
                 self._on_handshake(data, now)
         except Malformed:
             self._counts[Drop.MALFORMED] += 1
+        except Refused as refused:
+            self._counts[refused.drop] += 1
 
     def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
         """What may go to the network now."""
@@ -265,8 +264,8 @@ class Client:
         hello, rest = Hello.parse(data)
         handshake = self._handshake
         if handshake is None or hello != handshake.hello or data[0] not in _TAKES.get(self.phase, ()):
-            self._counts[Drop.UNEXPECTED] += 1
-        elif data[0] == Kind.COOKIE:
+            raise Refused(Drop.UNEXPECTED)
+        if data[0] == Kind.COOKIE:
             if len(rest) != wire.COOKIE_SIZE:
                 raise Malformed("a cookie of another length")
             # Since the last HELLO, whichever was answered: at worst the PROOF is repeated a little early.
@@ -290,13 +289,12 @@ class Client:
     def _on_offer(self, handshake: ClientHandshake, body: bytes, now: float) -> None:
         try:
             agreed = handshake.accept(body, self._trust, server_name=self._server_name, at=self._wall())
-        except HandshakeRefused as refused:
-            self._counts[refused.drop] += 1
+        except Refused as refused:
             self._why = events.HandshakeFailed(f"the server's offer is refused: {refused}", refused.hint)
             self._bad_offers += 1
             if self._bad_offers >= MAX_BAD_OFFERS:
                 self._fail(now)
-            return
+            raise
         self.phase = Phase.CONFIRMING
         self._handshake = None
         youngest, oldest = SESSION_SECONDS
@@ -319,35 +317,22 @@ class Client:
     # Session
 
     def _on_data(self, data: bytes, now: float) -> None:
-        session, number = self._session, int.from_bytes(data[9 : wire.DATA_HEADER_SIZE], "big")
-        if len(data) <= wire.DATA_OVERHEAD:
-            raise Malformed("a packet without a frame")
+        session = self._session
         if session is None or data[1:9] != self._cid:
-            self._counts[Drop.UNKNOWN_CONNECTION] += 1
-        elif session.replay.seen(number):
-            self._counts[Drop.REPLAYED] += 1
-        else:
-            try:
-                frame = session.opens.open(data, number)
-            except InvalidTag:
-                self._counts[Drop.TAG] += 1
-                return
-            newest = number > session.replay.highest
-            session.replay.mark(number)
-            session.heard = now
-            try:
-                self._take(session, frame, newest, now)
-            except Malformed:
-                self._end(End.PROTOCOL, now)
+            raise Refused(Drop.UNKNOWN_CONNECTION)
+        number, frame = session.opens.open(data, session.replay)
+        newest = number > session.replay.highest
+        session.replay.mark(number)
+        session.heard = now
+        try:
+            if (reason := parse_close(frame)) is not None:
+                self._end(reason, now)
+            else:
+                self._on_answer(session, Answer.parse(frame), newest, now)
+        except Malformed:
+            self._end(End.PROTOCOL, now)
 
-    def _take(self, session: _Session, frame: bytes, newest: bool, now: float) -> None:
-        if frame[0] == Frame.CLOSE and len(frame) == 2 and frame[1] < len(CLOSE_CODES):
-            reason = CLOSE_CODES[frame[1]]
-            self._end(End.CLOSED_BY_PEER if reason is End.CLOSED else reason, now)
-            return
-        if frame[0] != Frame.ANSWER:
-            raise Malformed(f"frame {frame[0]} does not exist, or not for a client")
-        answer = Answer.parse(frame)
+    def _on_answer(self, session: _Session, answer: Answer, newest: bool, now: float) -> None:
         if answer.time_ms > LATEST_MS:
             raise Malformed("a time beyond any clock")
         session.sending.acknowledged(answer, now)

@@ -7,17 +7,13 @@ from datetime import datetime
 from enum import StrEnum
 from typing import NamedTuple
 
-from rosbridge_eth.channel.wire import Mode, Reason
+from rosbridge_eth.channel.wire import Frame, Malformed, Mode, Reason
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.identity import PeerIdentity
 
 
 class Full(NetworkError):
-    """No more is taken until some of what was sent is acknowledged; ask `room` first."""
-
-
-class NotConnected(NetworkError):
-    """There is no session to send on; wait for Connected."""
+    """There is no session, or no more is taken until some of what was sent is acknowledged; ask `room` first."""
 
 
 class End(StrEnum):
@@ -32,8 +28,21 @@ class End(StrEnum):
     EXPIRED = "the session's time or packet numbers are used up"
 
 
-CLOSE_CODES = (End.CLOSED, End.PROTOCOL, End.REPLACED, End.REVOKED, End.EXPIRED, End.SILENT)
-"""The reasons of a CLOSE, by their number."""
+_CLOSE_CODES = (End.CLOSED, End.PROTOCOL, End.REPLACED, End.REVOKED, End.EXPIRED, End.SILENT)
+
+
+def close_frame(reason: End) -> bytes:
+    return bytes((Frame.CLOSE, _CLOSE_CODES.index(reason)))
+
+
+def parse_close(frame: bytes) -> End | None:
+    """Why the peer ends the session; None if it does not."""
+    if frame[0] != Frame.CLOSE:
+        return None
+    if len(frame) != 2 or frame[1] >= len(_CLOSE_CODES):
+        raise Malformed("a close for no reason that exists")
+    reason = _CLOSE_CODES[frame[1]]
+    return End.CLOSED_BY_PEER if reason is End.CLOSED else reason
 
 
 class Drop(StrEnum):
@@ -53,6 +62,14 @@ class Drop(StrEnum):
     REPLAYED = "packet number seen before"
     TAG = "authentication failed"
     FULL = "no room to keep it until what comes before it is there"
+
+
+class Refused(Exception):
+    """A datagram is not accepted; `hint` is what its sender may be told."""
+
+    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
+        super().__init__(why)
+        self.drop, self.hint = drop, hint
 
 
 class Connected(NamedTuple):

@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import wire
-from rosbridge_eth.channel.events import Drop
+from rosbridge_eth.channel.events import Drop, Refused
 from rosbridge_eth.channel.protection import SessionSecrets, finished
 from rosbridge_eth.channel.wire import Hello, Malformed, Mode, Reason
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust
@@ -47,15 +47,6 @@ POINT_SIZE = 65
 MAC_SIZE = 32
 ROOM_FOR_SECRET = bytes(256)
 """Zeros behind a PROOF in mode `transport`, whose answer is longer by C: an answer is never longer than what asked."""
-
-
-class HandshakeRefused(Exception):
-    """The peer's handshake message is not accepted; `hint` is what it may be told."""
-
-    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
-        super().__init__(why)
-        self.drop = drop
-        self.hint = hint
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +80,9 @@ def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], lis
     try:
         parts, offsets = wire.parse_fields(body, len(lengths))
     except Malformed as error:
-        raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
+        raise Refused(Drop.MALFORMED, str(error)) from error
     if any(length not in (None, len(part)) for length, part in zip(lengths, parts, strict=True)):
-        raise HandshakeRefused(Drop.MALFORMED, "a field has another length")
+        raise Refused(Drop.MALFORMED, "a field has another length")
     return parts, offsets
 
 
@@ -125,7 +116,7 @@ class ClientHandshake:
         return unsigned + signature + (b"" if self._ephemeral else ROOM_FOR_SECRET)
 
     def accept(self, body: bytes, trust: Trust, *, server_name: str | None, at: datetime) -> Agreed:
-        """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
+        """Verify an OFFER's body; Refused leaves this attempt as it was, ready for another."""
         lengths = (
             wire.NONCE_SIZE, wire.CID_SIZE, None, None, POINT_SIZE if self._ephemeral else None, None, MAC_SIZE,
         )  # fmt: skip
@@ -134,7 +125,7 @@ class ClientHandshake:
             peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
             hint = Reason.EXPIRED if isinstance(error, ids.ExpiredCertificate) else None
-            raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
+            raise Refused(Drop.CERTIFICATE, str(error), hint) from error
         transcript = self._transcript.copy()
         transcript.update(body[: offsets[5]])
         try:
@@ -145,13 +136,13 @@ class ClientHandshake:
             else:
                 shared = self._identity.encryption_key.decrypt(material)
         except SMCryptoError as error:
-            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold") from error
+            raise Refused(Drop.SIGNATURE, "the offer does not hold") from error
         if len(shared) != SHARED_SIZE:
-            raise HandshakeRefused(Drop.MALFORMED, "the secret has another length")
+            raise Refused(Drop.MALFORMED, "the secret has another length")
         transcript.update(body[offsets[5] : offsets[6]])
         keys = SessionSecrets(shared, transcript.digest(), self.hello.mode)
         if not hmac.compare_digest(mac, finished(keys.finished, transcript.digest())):
-            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold")
+            raise Refused(Drop.SIGNATURE, "the offer does not hold")
         return Agreed(peer, keys, server_cid)
 
 
@@ -159,7 +150,7 @@ def answer_proof(
     hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, server_cid: bytes,
     randomness: Randomness, at: datetime,
 ) -> Agreed:  # fmt: skip
-    """A server's side, from a whole PROOF. HandshakeRefused unless its certificates and signature hold; the cookie was
+    """A server's side, from a whole PROOF. Refused unless its certificates and signature hold; the cookie was
     checked before. The session stands when a packet of the client's opens."""
     exchange = hello.mode is Mode.EXCHANGE
     (signing, encryption, point, signature), offsets = _parse(body, (None, None, POINT_SIZE if exchange else 0, None))
@@ -167,7 +158,7 @@ def answer_proof(
         peer = trust.check(signing, encryption, role=Role.ROBOT, at=at)
     except ids.UntrustedCertificate as error:
         hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
-        raise HandshakeRefused(Drop.CERTIFICATE, str(error), hints.get(type(error), Reason.CERTIFICATE)) from error
+        raise Refused(Drop.CERTIFICATE, str(error), hints.get(type(error), Reason.CERTIFICATE)) from error
     transcript = _transcript(hello, cookie)
     transcript.update(body[: offsets[3]])
     try:
@@ -180,7 +171,7 @@ def answer_proof(
             shared = randomness.bytes(SHARED_SIZE)
             material = peer.encryption_certificate.public_key.encrypt(shared)
     except SMCryptoError as error:
-        raise HandshakeRefused(Drop.SIGNATURE, "the proof does not hold") from error
+        raise Refused(Drop.SIGNATURE, "the proof does not hold") from error
     transcript.update(body[offsets[3] : offsets[4]])
     mine = (identity.signing_certificate.to_der(), identity.encryption_certificate.to_der())
     unsigned = wire.fields([randomness.bytes(wire.NONCE_SIZE), server_cid, *mine, material])

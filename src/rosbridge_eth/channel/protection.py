@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import hmac
 
-from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, Kind, Mode
-from smcrypto import kdf, sm3, sm4
+from rosbridge_eth.channel.events import Drop, Refused
+from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, DATA_OVERHEAD, Kind, Malformed, Mode
+from smcrypto import InvalidTag, kdf, sm3, sm4
 
 SESSION_PACKETS = 1 << 20
 """A session ends when so many packets were sent in a direction."""
@@ -52,10 +53,18 @@ class Direction:
         header = b"%c%b%b" % (Kind.DATA, cid, number.to_bytes(4, "big"))
         return header + self._aead.encrypt((self._iv ^ number).to_bytes(12, "big"), frame, header)
 
-    def open(self, datagram: bytes, number: int) -> bytes:
-        """The frame of a datagram whose packet number is `number`, or smcrypto.InvalidTag."""
+    def open(self, datagram: bytes, replay: ReplayWindow) -> tuple[int, bytes]:
+        """Number and frame of a datagram, which `replay` has not seen; else Refused or Malformed."""
+        if len(datagram) <= DATA_OVERHEAD:
+            raise Malformed("a packet without a frame")
+        number = int.from_bytes(datagram[9:DATA_HEADER_SIZE], "big")
+        if replay.seen(number):
+            raise Refused(Drop.REPLAYED)
         nonce = (self._iv ^ number).to_bytes(12, "big")
-        return self._aead.decrypt(nonce, datagram[DATA_HEADER_SIZE:], datagram[:DATA_HEADER_SIZE])
+        try:
+            return number, self._aead.decrypt(nonce, datagram[DATA_HEADER_SIZE:], datagram[:DATA_HEADER_SIZE])
+        except InvalidTag:
+            raise Refused(Drop.TAG) from None
 
 
 class ReplayWindow:

@@ -16,13 +16,12 @@ from hashlib import blake2s
 from rosbridge_eth.channel import events, wire
 from rosbridge_eth.channel.admission import Address, Cookies, TokenBucket
 from rosbridge_eth.channel.client import utc_now
-from rosbridge_eth.channel.events import CLOSE_CODES, Drop, End, Event, ServerConfig
-from rosbridge_eth.channel.handshake import Agreed, HandshakeRefused, Randomness, answer_proof
+from rosbridge_eth.channel.events import Drop, End, Event, Refused, ServerConfig, close_frame, parse_close
+from rosbridge_eth.channel.handshake import Agreed, Randomness, answer_proof
 from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
 from rosbridge_eth.channel.transfer import ACK_DELAY, ACK_EVERY, NEVER, Early, Receiving
 from rosbridge_eth.channel.wire import Answer, Assembly, Frame, Hello, Kind, Malformed, Reason
 from rosbridge_eth.identity import Identity, Trust
-from smcrypto import InvalidTag
 
 HANDSHAKE_LIFETIME = 20.0
 """s that a cookie holds, and that pieces of a PROOF, an OFFER, and a session without a packet are kept."""
@@ -190,7 +189,7 @@ class Server:
                 self._on_handshake(data, address, now)
         except Malformed:
             self._counts[Drop.MALFORMED] += 1
-        except HandshakeRefused as refused:
+        except Refused as refused:
             self._counts[refused.drop] += 1
 
     def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
@@ -243,14 +242,14 @@ class Server:
     def _on_handshake(self, data: bytes, address: Address, now: float) -> None:
         hello, rest = Hello.parse(data)
         if hello.mode not in self.config.modes:
-            raise HandshakeRefused(Drop.MODE)
+            raise Refused(Drop.MODE)
         if data[0] == Kind.HELLO and rest == wire.HELLO_PADDING:
             self._counts["cookies"] += 1
             self._outbox.append((hello.datagram(Kind.COOKIE, self._cookies.make(address, hello, now)), address))
         elif data[0] == Kind.PROOF:
             cookie, piece = rest[: wire.COOKIE_SIZE], wire.parse_piece(rest[wire.COOKIE_SIZE :])
             if not self._cookies.holds(cookie, address, hello, now):
-                raise HandshakeRefused(Drop.COOKIE)
+                raise Refused(Drop.COOKIE)
             self._on_proof((address, hello), cookie, piece, len(data), now)
         else:
             raise Malformed("not for a server")
@@ -274,14 +273,14 @@ class Server:
         if body is None:
             return
         if len(self._sessions) - len(self._by_name) >= self.config.max_half_open:
-            raise HandshakeRefused(Drop.HALF_OPEN)
+            raise Refused(Drop.HALF_OPEN)
         if self._share.available(now) <= 0:
-            raise HandshakeRefused(Drop.BUSY)  # it is examined when it comes again
+            raise Refused(Drop.BUSY)  # it is examined when it comes again
         del self._proofs[key]
         began = self._stopwatch()
         try:
             self._offer(key, cookie, body, proof.size, now)
-        except HandshakeRefused as refused:
+        except Refused as refused:
             if refused.hint is not None:
                 self._outbox.append((key[1].datagram(Kind.REFUSAL, bytes((refused.hint,))), key[0]))
             raise
@@ -290,7 +289,7 @@ class Server:
 
     def _offer(self, key: tuple[Address, Hello], cookie: bytes, body: bytes, credit: int, now: float) -> None:
         if len(self._sessions) >= self.config.max_connections:
-            raise HandshakeRefused(Drop.CONNECTIONS, "no room for another connection", Reason.FULL)
+            raise Refused(Drop.CONNECTIONS, "no room for another connection", Reason.FULL)
         cid = self._randomness.bytes(wire.CID_SIZE)
         agreed = answer_proof(
             key[1], cookie, body, identity=self._identity, trust=self._trust, server_cid=cid,
@@ -302,20 +301,10 @@ class Server:
     # Sessions
 
     def _on_data(self, data: bytes, address: Address, now: float) -> None:
-        if len(data) <= wire.DATA_OVERHEAD:
-            raise Malformed("a packet without a frame")
-        session, number = self._sessions.get(data[1:9]), int.from_bytes(data[9 : wire.DATA_HEADER_SIZE], "big")
+        session = self._sessions.get(data[1:9])
         if session is None:
-            self._counts[Drop.UNKNOWN_CONNECTION] += 1
-            return
-        if session.replay.seen(number):
-            self._counts[Drop.REPLAYED] += 1
-            return
-        try:
-            frame = session.opens.open(data, number)
-        except InvalidTag:
-            self._counts[Drop.TAG] += 1
-            return
+            raise Refused(Drop.UNKNOWN_CONNECTION)
+        number, frame = session.opens.open(data, session.replay)
         if self._by_name.get(session.peer.name) is not session:
             self._stand(session)
         session.heard = now
@@ -352,13 +341,12 @@ class Server:
         self._events.append(events.Connected(session.peer, session.cid))
 
     def _take(self, session: _Session, frame: bytes) -> bool | None:
-        """Whether it asks for an answer at once; None where it gets none, since it is the last or finds no room."""
+        """Whether it asks for an answer at once; None where it was the last."""
         kind, rest = frame[0], frame[1:]
         if kind == Frame.PROBE and not any(rest):
             return True
-        if kind == Frame.CLOSE and len(rest) == 1 and rest[0] < len(CLOSE_CODES):
-            reason = CLOSE_CODES[rest[0]]
-            self._remove(session, End.CLOSED_BY_PEER if reason is End.CLOSED else reason, told=True)
+        if (reason := parse_close(frame)) is not None:
+            self._remove(session, reason, told=True)
             return None
         if kind != Frame.SEGMENT or len(rest) <= 4:
             raise Malformed(f"frame {kind} does not exist, or not with {len(rest)} bytes behind it")
@@ -366,8 +354,7 @@ class Server:
         if receiving.known(index):
             self._counts["duplicates"] += 1
         elif not receiving.take(index, rest[4:]):
-            self._counts[Drop.FULL] += 1  # not marked, so not acknowledged: it comes again when there may be room
-            return None
+            raise Refused(Drop.FULL)  # not marked, so not acknowledged: it comes again when there may be room
         self._counts["messages_received"] += len(receiving.messages)
         self._events.extend(events.Message(session.cid, payload) for payload in receiving.messages)
         receiving.messages.clear()
@@ -377,8 +364,7 @@ class Server:
         """told: the client knows."""
         if self._by_name.get(session.peer.name) is session:
             del self._by_name[session.peer.name]
-            close = bytes((Frame.CLOSE, CLOSE_CODES.index(reason))) if not told else b""
-            if close and (datagram := session.seal(close)) is not None:
+            if not told and (datagram := session.seal(close_frame(reason))) is not None:
                 self._outbox.append((datagram, session.address))
             self._events.append(events.Disconnected(reason, session.cid, session.peer))
         session.receiving.release()

@@ -201,8 +201,8 @@ class Answer(NamedTuple):
 
     @staticmethod
     def parse(frame: bytes) -> Answer:
-        if len(frame) < _ANSWER.size:
-            raise Malformed("an answer ends early")
+        if len(frame) < _ANSWER.size or frame[0] != Frame.ANSWER:
+            raise Malformed("a frame that does not exist or is not for a client, or an answer that ends early")
         _, largest, next_segment, time_ms, size = _ANSWER.unpack_from(frame)
         stop = _ANSWER.size + size
         if stop > len(frame) or size > ACK_BITS // 8 or len(frame) - stop > MAX_STATE:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from bridge.channel.steps import HERE, Steps, dropped, events, flipped, message, segment
 from bridge.channel.world import SERVER_ADDRESS, make_client, make_server, robot
-from rosbridge_eth.channel import MAX_STATE, Disconnected, Drop, End, Full, Message, NotConnected, ServerConfig, State
+from rosbridge_eth.channel import MAX_STATE, Disconnected, Drop, End, Full, Message, ServerConfig, State
 from rosbridge_eth.channel.transfer import RESERVED_SEGMENTS, SEGMENTS
 from rosbridge_eth.channel.wire import (
     PROBE,
@@ -190,7 +190,7 @@ def test_an_end_takes_no_more_than_there_is_room_for(monkeypatch):
     steps.server.set_state(connection, b"to nobody")
     steps.client.close(steps.now)
     assert steps.client.room() == 0
-    with pytest.raises(NotConnected):
+    with pytest.raises(Full):
         steps.client.send(b"")
 
 

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.channel.steps import Steps, events
-from rosbridge_eth.channel import Message
+from rosbridge_eth.channel import Drop, Message
 from rosbridge_eth.channel.admission import Cookies, TokenBucket
 from rosbridge_eth.channel.delivery import GAIN, INITIAL_WINDOW, MINIMUM_WINDOW, QUEUE_SHARE, RoundTrip, Window
+from rosbridge_eth.channel.events import Refused
 from rosbridge_eth.channel.protection import Direction, ReplayWindow
 from rosbridge_eth.channel.transfer import Early, Receiving
 from rosbridge_eth.channel.wire import ACK_BITS, MAX_STATE, Answer, Hello, Malformed, Mode, fields, parse_fields
-from smcrypto import InvalidTag
 
 
 @given(st.lists(st.integers(0, 5000), max_size=300))
@@ -195,15 +195,19 @@ def test_a_packet_opens_under_its_key_its_number_and_its_header_only():
     keys = Direction(b"s" * 32)
     packet = keys.seal(b"12345678", 7, b"frames")
     assert packet[:13] == b"\x4012345678" + (7).to_bytes(4, "big")
-    assert Direction(b"s" * 32).open(packet, 7) == b"frames"
-    for other, data, number in (
-        (Direction(b"t" * 32), packet, 7),
-        (keys, packet, 8),
-        (keys, b"\x41" + packet[1:], 7),
-        (keys, packet[:5] + b"x" + packet[6:], 7),
+    assert Direction(b"s" * 32).open(packet, ReplayWindow()) == (7, b"frames")
+    seen = ReplayWindow()
+    seen.mark(7)
+    for other, data, replay, drop in (
+        (Direction(b"t" * 32), packet, ReplayWindow(), Drop.TAG),
+        (keys, packet[:12] + b"\x08" + packet[13:], ReplayWindow(), Drop.TAG),
+        (keys, b"\x41" + packet[1:], ReplayWindow(), Drop.TAG),
+        (keys, packet[:5] + b"x" + packet[6:], ReplayWindow(), Drop.TAG),
+        (keys, packet, seen, Drop.REPLAYED),
     ):
-        with pytest.raises(InvalidTag):
-            other.open(data, number)
+        with pytest.raises(Refused) as refused:
+            other.open(data, replay)
+        assert refused.value.drop is drop
 
 
 def test_noise_to_either_end_changes_nothing():

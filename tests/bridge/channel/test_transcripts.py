@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosbridge_eth.channel.protection import Direction, SessionSecrets
+from rosbridge_eth.channel.protection import Direction, ReplayWindow, SessionSecrets
 from rosbridge_eth.channel.wire import PROBE, Answer, Mode
 from rosbridge_eth.identity import Role
 from smcrypto import sm2
@@ -237,9 +237,9 @@ def test_our_functions_give_the_recorded_values(v):
 
     secrets = SessionSecrets(v.shared, v.h3, Mode[v.mode.upper()])
     assert (secrets.client, secrets.server) == (v.client_secret, v.server_secret)
-    assert Direction(v.client_secret).open(v.first, 0) == PROBE
-    assert Direction(v.client_secret).open(v.message, 1).endswith(v.message_payload)
-    answer = Answer.parse(Direction(v.server_secret).open(v.state, 1))
+    assert Direction(v.client_secret).open(v.first, ReplayWindow()) == (0, PROBE)
+    assert Direction(v.client_secret).open(v.message, ReplayWindow())[1].endswith(v.message_payload)
+    answer = Answer.parse(Direction(v.server_secret).open(v.state, ReplayWindow())[1])
     assert (answer.data, answer.time_ms, answer.largest, answer.bits) == (v.state_data, v.server_time_ms, 0, 1)
     if v.mode == "exchange":
         proof = split(b"".join(data[53:] for data in v.proof), 4)
