@@ -367,8 +367,8 @@ class Site:
     def outstanding(self, robot: bytes) -> str:
         """What the server has still to do for a robot; empty if nothing."""
         with closing(open_store(load_server_config(self.home.config), self.home, read_only=True)) as inbox:
-            waiting, hold = inbox.totals().get(robot), inbox.state(robot).hold
-        return f"{waiting.chunks} chunks wait ({hold})" if waiting is not None and waiting.chunks else ""
+            waiting, [state] = inbox.waiting(robot), inbox.states([robot])
+        return f"{waiting.chunks} chunks wait ({state.hold})" if waiting.chunks else ""
 
     def dead_letters(self, robot: bytes) -> set[bytes]:
         with closing(open_store(load_server_config(self.home.config), self.home, read_only=True)) as inbox:
@@ -621,7 +621,7 @@ def kill_node(site: Site, seed: int) -> Count:
 
 
 def kill_redis(site: Site, seed: int) -> Count:
-    """kill -9 of the Redis that holds the inbox; its append-only file brings it back."""
+    """kill -9 of the Redis that holds the store; its append-only file brings it back."""
     flow = Flow(site, "Redis killed", seed)
     flow.start()
     for _ in range(2):
@@ -715,7 +715,7 @@ def full_disk_of_robot(site: Site, seed: int) -> Count:
 
 
 def full_disk_of_server(site: Site, seed: int) -> Count:
-    """The disk of the server's inbox and journal is full for a while: nothing is acknowledged that is not kept."""
+    """The disk of the server's store is full for a while: nothing is acknowledged that is not kept."""
     disk = site.home.path.parent
     if not os.path.ismount(disk):
         raise Unavailable("the server's home is on no disk of its own (needs root)")
@@ -724,10 +724,10 @@ def full_disk_of_server(site: Site, seed: int) -> Count:
     program = flow.start()
     flow.pause(0.1, 0.3)
     ballast = fill_up(disk)
-    flow.event("the disk of inbox and journal is full")
+    flow.event("the disk of the store is full")
     assert site.server is not None
     server = site.server
-    until("the server says that it takes nothing", lambda: "the inbox: " in server.said, 20)
+    until("the server says that it takes nothing", lambda: "the store: " in server.said, 20)
     flow.pause(0.2, 0.5)
     ballast.unlink()
     flow.finish(program)

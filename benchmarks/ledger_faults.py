@@ -3,8 +3,8 @@
     python benchmarks/ledger_faults.py [--chain anvil|clique] [--seeds A:B] [--seconds S] [--out FILE]
 
 Each seed is a run of its own: a real node (anvil with a block a second or two a second, or a geth that signs blocks
-by Clique, named by GETH), the contract, an inbox, the submitter as a process, and two robots that seal chunks, send
-them to the inbox as the server's workers do, and again what they do not know to be confirmed. For `seconds` the
+by Clique, named by GETH), the contract, a store, the submitter as a process, and two robots that seal chunks, send
+them to the store as the server does, from where that says that it has the log. For `seconds` the
 faults that the seed draws come in between:
 
     kill        the submitter is killed (-9) and started again         rival      a second submitter, by mistake
@@ -12,11 +12,11 @@ faults that the seed draws come in between:
     foreign     the robot's key is used elsewhere                       spike      the price of gas rises
     reorg       the newest blocks are replaced, below N                 deep       and beyond N
     limit       the node answers 429 to most requests                   cut        its answers are lost
-    lost        the inbox is deleted                                    old        an old copy of it is put back
+    lost        the store is deleted                                    old        an old copy of it is put back
 
 Then it is left alone until all is written, and the chain is read. `missing` counts chunks that were sealed and are
 not there, `doubled` those that are there twice, `disorder` those out of the log's order; all have to be 0. A seed has
-either deep reorganisations or lost inboxes: with both, what the robot was told to be confirmed is nowhere.
+either deep reorganisations or lost stores:  with both, what the robot was told to be confirmed is nowhere.
 `reverted` counts transactions that were in a block for nothing. One line of JSON for each seed.
 """
 
@@ -47,12 +47,12 @@ import requests
 import geth_network
 from ports import free_port
 from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.inbox import Inbox
-from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.log.sqlite import SqliteStore
+from rosbridge_eth.log.store import NO_DIGEST, Offer, Store, place_of
 from rosbridge_eth.server import submitter
 from smcrypto import sm2
 
@@ -199,18 +199,24 @@ class Proxy:
 
 
 class Robot:
-    """Seals chunks; offers them to the inbox; keeps what it was not told to be confirmed."""
+    """Seals chunks; offers them to the store; keeps what it was not told to be confirmed."""
 
     def __init__(self, number: int, ledger: bytes, dice: random.Random) -> None:
         self.account, self.tk = KEYS.robot(number), robot_id(f"robot_{number}")
         self._log, self._dice = Log(ledger, self.tk), dice
         self.written: list[Chunk] = []
         self.told = 0  # how many chunks it was told to be confirmed
-        self._previous, self._stream, self._number = bytes(32), dice.randbytes(16), 0
+        self._streams = 0
+        self._begin()
+        self._previous = NO_DIGEST
+
+    def _begin(self) -> None:
+        self._streams += 1
+        self._stream, self._number = self._streams.to_bytes(8, "big") + self._dice.randbytes(8), 0
 
     def seal(self) -> None:
         if self._dice.random() < 0.1:
-            self._stream, self._number = self._dice.randbytes(16), 0
+            self._begin()
             self._previous = self._previous if self._dice.random() < 0.8 else bytes(32)
         lines = [b"x" * self._dice.choice([100, 8_000, 30_000])] if self._dice.random() < 0.7 else []
         chunk = seal(self._log, SIGNER, lines, stream=self._stream, number=self._number, previous=self._previous,
@@ -218,23 +224,29 @@ class Robot:
         self._previous, self._number = chunk.header.digest, self._number + 1
         self.written.append(chunk)
 
-    def offer(self, inbox: Inbox, since: int | None = None) -> None:
-        since = self.told if since is None else since
-        inbox.append([(self.tk, chunk) for chunk in self.written[since:]], time.time())
+    def offer(self, store: Store) -> None:
+        """What follows the store's head, of what is not confirmed; the first as the oldest that there is."""
+        [state] = store.states([self.tk])
+        chunks = [chunk for chunk in self.written[self.told :] if place_of(chunk.header) > state.head]
+        offers, front = list[Offer](), state.digest
+        for chunk in chunks:
+            offers.append(Offer(self.tk, chunk, front))
+            front = chunk.header.digest
+        store.append(offers, time.time())
 
-    def listen(self, inbox: Inbox) -> None:
-        places = [(chunk.header.stream, chunk.header.number) for chunk in self.written]
-        confirmed = inbox.state(self.tk).confirmed
+    def listen(self, store: Store) -> None:
+        places = [place_of(chunk.header) for chunk in self.written]
+        confirmed = store.states([self.tk])[0].confirmed
         if confirmed in places:
             self.told = max(self.told, places.index(confirmed) + 1)
 
 
-def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
+def submit(url: str, contract: str, path: str, ledger: str) -> None:
     """The child: a submitter, until it is killed."""
     submitter.PATIENCE = PATIENCE  # the runs are short
     submitter.LONGEST_PAUSE = 2.0
     keys = {robot_id(f"robot_{n}"): KEYS.robot(n) for n in range(1, ROBOTS + 1)}
-    store = SqliteInbox(Path(inbox), bytes.fromhex(ledger), 10**9, 10**8)
+    store = SqliteStore(Path(path), bytes.fromhex(ledger), 10**9, 10**8)
     writer = submitter.Submitter(
         Ledger(url, contract, timeout=5), store, keys.keys, keys.get, KEYS.operator,
         submitter.Settings(confirmations=CONFIRMATIONS, gas_per_day=10**12),
@@ -243,7 +255,7 @@ def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
     while True:
         try:
             time.sleep(writer.turn(time.time()))
-            holds = [store.state(tk).hold for tk in keys]
+            holds = [state.hold for state in store.states([*keys])]
             if said != (said := (writer.trouble, writer.funds, writer.unconfirmed, *holds)):
                 print(f"{time.time():.1f}", *said, dict(writer.counts), sep=" | ", file=sys.stderr, flush=True)
         except BridgeError as error:
@@ -265,18 +277,18 @@ class World:
         self.node.floor = self.ledger.block_number()
         self.proxy = Proxy(self.node.url)
         stack.callback(self.proxy.close)
-        self.folder, self.inboxes = folder, 0
+        self.folder, self.stores = folder, 0
         self.copy: Path | None = None
         self.processes: list[subprocess.Popen[bytes]] = []
         stack.callback(self.stop)
         self.counts: Counter[str] = Counter()
-        self.new_inbox()
+        self.new_store()
         self.start()
 
-    def new_inbox(self, path: Path | None = None) -> None:
-        self.inboxes += 1
-        self.path = path or self.folder / f"inbox-{self.inboxes}"
-        self.inbox = SqliteInbox(self.path, self.ledger.ledger, 10**9, 10**8)
+    def new_store(self, path: Path | None = None) -> None:
+        self.stores += 1
+        self.path = path or self.folder / f"store-{self.stores}"
+        self.store = SqliteStore(self.path, self.ledger.ledger, 10**9, 10**8)
 
     def start(self) -> None:
         command = [sys.executable, __file__, "--submit", self.proxy.url, self.ledger.contract, str(self.path),
@@ -332,7 +344,7 @@ class World:
     def lost(self) -> None:
         self.stop()
         self.listen()
-        self.new_inbox()
+        self.new_store()
         if self.dice.random() < 0.5:
             self.offer()
         self.start()
@@ -340,13 +352,13 @@ class World:
 
     def old(self) -> None:
         if self.copy is None:
-            self.copy = self.folder / f"copy-{self.inboxes}"
+            self.copy = self.folder / f"copy-{self.stores}"
             with closing(sqlite3.connect(self.path)) as source, closing(sqlite3.connect(self.copy)) as copy:
                 source.backup(copy)
             return
         self.stop()
         self.listen()
-        self.new_inbox(self.copy)
+        self.new_store(self.copy)
         self.copy = None
         self.start()
         self.offer()
@@ -355,11 +367,11 @@ class World:
 
     def listen(self) -> None:
         for robot in self.robots:
-            robot.listen(self.inbox)
+            robot.listen(self.store)
 
     def offer(self) -> None:
         for robot in self.robots:
-            robot.offer(self.inbox)
+            robot.offer(self.store)
 
     def rage(self, seconds: float) -> None:
         faults = ["kill", "kill", "rival", "drop", "drop", "empty", "foreign", "spike", "reorg", "reorg", "limit"]
@@ -370,7 +382,7 @@ class World:
             for robot in self.robots:
                 for _ in range(self.dice.choice([0, 0, 1, 1, 3, 9])):
                     robot.seal()
-                robot.offer(self.inbox, max(robot.told, len(robot.written) - 12))
+                robot.offer(self.store)
             self.listen()
             if self.dice.random() < 0.6:
                 fault = self.dice.choice(faults)

@@ -12,7 +12,7 @@ certificates, an account, a registration in the contract, a spool, a socket and
 chunks of the sample bag's Odometry, sealed by the robot's writer; each message
 is a chunk of its own, as if it were the only one of its second. The sessions
 are spread over a few client processes. The server's workers share one UDP
-port, commit to the inbox and answer; the submitter writes to the chain, and
+port, commit to the store and answer; the submitter writes to the chain, and
 the robots are told what is confirmed. At the end every robot's log is read
 back from the chain, compared byte by byte with what was sealed, verified and
 opened with the reader's key, and its messages compared with those captured.
@@ -79,10 +79,10 @@ from rosbridge_eth.reading import Verifier
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
 from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
-from rosbridge_eth.spool import Spool
 from smcrypto import sm2
 
 TOPIC = "/robot_1/odom"
@@ -296,7 +296,7 @@ class Operator:
             try:
                 wait = submitter.turn(time.time())
             except StoreError:
-                wait = 0.25  # as the supervisor does; the inbox connects anew
+                wait = 0.25  # as the supervisor does; the store connects anew
             time.sleep(min(wait, 0.25))
         peak = peak_kib()
         robots = self.robots[: report.recv()]
@@ -422,17 +422,18 @@ class Session:
         self._chunks: list[Chunk] = []
 
     def seal(self, messages: int, per_chunk: int) -> dict[bytes, bytes]:
-        writer = LogWriter(
+        self._writer = LogWriter(
             self._place, self.robot.signing_key, [self._operator.reader.encryption_certificate.public_key],
-            previous=self.spool.last_digest, stream_line=stream_line("bag", "load"), now=0.0,
+            previous=self.spool.last_digest, newest=self.spool.newest[:16], stream_line=stream_line("bag", "load"),
+            now=0.0,
         )
-        self._chunks = list(seal_all(writer, messages, per_chunk))
+        self._chunks = list(seal_all(self._writer, messages, per_chunk))
         return {chunk.header.digest: chunk.encoded for chunk in self._chunks}
 
     def connect(self) -> None:
         now = time.monotonic()
         self.client = Client(ClientConfig(), self.robot, self._operator.trust, "server", now)
-        self.sender = Sender(self.client, self.spool)
+        self.sender = Sender(self.client, self.spool, self._writer)
         self.sock, address = client_socket(self._server)
         self.client.connect(address, now)
 
@@ -454,14 +455,14 @@ class Session:
         client.handle_timer(now)
         while (event := client.next_event()) is not None:
             self.sender.handle(event, now)
-        self.sender.send()
+        self.sender.send(now)
         for data, place in client.datagrams_to_send(now):
             self.sock.sendto(data, place)
         return client.next_timer() or now + 1
 
     @property
     def connected(self) -> bool:
-        return self.sender.statistics.connected
+        return self.sender.connected
 
     @property
     def stored(self) -> bool:
@@ -503,9 +504,9 @@ def client_process(
     report.send(sum(session.spool.statistics().unstored for session in sessions))
     drive(sessions, lambda session: session.confirmed, limit)
     report.send({
-        "sent": sum(session.sender.statistics.sent for session in sessions),
-        "refused": sum(session.sender.statistics.refused for session in sessions),
-        "reconnected": sum(session.sender.statistics.sessions - 1 for session in sessions),
+        "sent": sum(session.sender.sent for session in sessions),
+        "refused": sum(session.sender.refused for session in sessions),
+        "reconnected": sum(session.sender.sessions - 1 for session in sessions),
         "retransmitted": sum(session.client.statistics()["retransmitted"] for session in sessions),
     })  # fmt: skip
     report.recv()
@@ -663,7 +664,7 @@ def rows(figures: Figures) -> list[tuple[str, str]]:
         ("messages proven, opened and equal", f"{f.equal}"),
         ("**lost / doubled / altered**", f"**{f.lost} / {f.doubled} / {f.altered}**"),
         ("the paper: reached its server", f"{paper:,} ({(1 - paper / f.sent):.2%} lost)" if paper else "–"),
-        ("messages a second into the inbox", f"{f.sent / f.sending:.0f}"),
+        ("messages a second into the store", f"{f.sent / f.sending:.0f}"),
         ("server's processor time a message, workers", f"{f.message_cpu_ms:.3f} ms"),
         ("of it decrypting the channel", f"{f.opening_ms / max(1, f.opened):.3f} ms a packet, {f.opening_ms:.0f} ms"),
         ("of it verifying signatures",

@@ -1,5 +1,6 @@
-// Reads a robot's log from a chain and proves it, independently of rosbridge_eth: written from docs/log.md alone,
-// on ethers (the chain), sm-crypto-v2 (SM2, SM3, SM4) and fzstd (Zstandard).
+// Reads a robot's log from a chain and proves it, independently of the bridge's Python: written from docs/log.md alone, on
+// ethers (the chain), sm-crypto-v2 (SM2, SM3, SM4) and fzstd (Zstandard). What it has in common with the page of evidence
+// (certificates, header, signature, lines) is in evidence.js.
 //
 //   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX]
 //
@@ -13,10 +14,12 @@
 
 import { readFileSync } from 'node:fs'
 import { parseArgs } from 'node:util'
-import { Contract, JsonRpcProvider, id as keccakOfText, getBytes, keccak256 } from 'ethers'
+import { Contract, JsonRpcProvider, getBytes, keccak256 } from 'ethers'
 import { Decompress } from 'fzstd'
 import { sm2, sm3, sm4 } from 'sm-crypto-v2'
+import evidence from '../src/rosbridge_eth/reading/evidence.js'
 
+const { big, certificate, chunkOf, element, hex, isSigned, join, lineOf, logOf, signer, word } = evidence
 const ABI = [
   `function standings(bytes32[] Tks) view returns (tuple(address account, bytes32 certificatesHash, bool revoked,
      uint256 chunks, bytes32 tail, uint256 balance, uint256 dataBlock, uint256 changedBlock)[])`,
@@ -26,29 +29,16 @@ const ABI = [
   'event Revoked(bytes32 indexed Tk, address indexed account, uint256 index, uint256 previousBlock)',
 ]
 const SPAN = 2000 // blocks asked for at once
-const MAX = { body: 65536, readers: 16, records: 1000, plaintext: 4 << 20, line: 60 << 10, depth: 100, block: 128 << 10 }
-const FIXED = 1 + 1 + 16 + 8 + 32 + 8 + 4 + 32 + 4 + 32 + 1
-const GRANT = 113
+const MAX = { plaintext: 4 << 20, block: 128 << 10 }
 const ZEROS = '00'.repeat(32)
 
 const text = new TextEncoder()
-const hex = (bytes) => Buffer.from(bytes).toString('hex')
-const join = (...parts) => new Uint8Array(Buffer.concat(parts.map((part) => Buffer.from(part))))
 const digest = (...parts) => getBytes('0x' + sm3(join(...parts)))
 const hmac = (key, data) => getBytes('0x' + sm3(data, { key: hex(key) }))
-const bigEndian = (number, size) => getBytes('0x' + BigInt(number).toString(16).padStart(2 * size, '0'))
 // JSON text without what acts on a terminal; the same JSON.
 const printable = (json) =>
   json.replace(/[\u007f-\u009f\u200b-\u200f\u2028-\u202e\u2060-\u206f]/g,
     (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0'))
-const number = (bytes) => BigInt('0x' + (hex(bytes) || '0'))
-const holds = (key, message, signature, der) => {
-  try {
-    return sm2.doVerifySignature(message, hex(signature), key, { hash: true, der })
-  } catch {
-    return false // not even in the form of a signature
-  }
-}
 
 class Wrong extends Error {
   constructor(kind, detail = '') {
@@ -56,133 +46,16 @@ class Wrong extends Error {
     this.kind = kind
   }
 }
-
-// --- X.509 (RFC 5280), as far as it is needed
-
-// One value. DER's lengths have one form (X.690, 10.1).
-function element(der, at) {
-  let length = der[at + 1]
-  let start = at + 2
-  if (length >= 0x80) {
-    start += length & 0x7f
-    const size = der.slice(at + 2, start)
-    if (size.length < 1 || size.length > 3 || size[0] === 0) throw new Wrong('untrusted', 'a certificate is not DER')
-    length = Number(number(size))
-    if (length < 0x80) throw new Wrong('untrusted', 'a certificate is not DER')
-  }
-  const end = start + length
-  if (!(end <= der.length)) throw new Wrong('untrusted', 'a certificate ends early')
-  return { tag: der[at], whole: der.slice(at, end), content: der.slice(start, end), end }
-}
-
-function members(content) {
-  const found = []
-  for (let at = 0; at < content.length; at = found.at(-1).end) found.push(element(content, at))
-  return found
-}
-
-const SM2_WITH_SM3 = '06082a811ccf55018375'
-const SM2_KEY = '301306072a8648ce3d020106082a811ccf5501822d'
-const HARMLESS = new Set(['551d0e', '551d20', '551d23']) // identifiers of keys, and policies: any is taken
-const bits = (part) => part.content.slice(1)
-
-function certificate(der) {
-  const [signed, algorithm, signature] = members(element(der, 0).content)
-  const [version, , inner, issuer, validity, subject, keyInfo, ...rest] = members(signed.content)
-  if (version.tag !== 0xa0 || hex(version.content) !== '020102') throw new Wrong('untrusted', 'not of version 3')
-  const [kind, point] = members(keyInfo.content)
-  const sm2Alone = [algorithm, inner].every((used) => hex(members(used.content)[0].whole) === SM2_WITH_SM3)
-  if (!sm2Alone || hex(kind.whole) !== SM2_KEY) throw new Wrong('untrusted', 'not of SM2 and SM3')
-  const [from, until] = members(validity.content).map(({ tag, content }) => {
-    const t = Buffer.from(content).toString('latin1')
-    const full = tag === 0x17 ? (t < '50' ? '20' : '19') + t : t
-    return Date.parse(full.replace(/^(....)(..)(..)(..)(..)(..)Z$/, '$1-$2-$3T$4:$5:$6Z'))
-  })
-  const found = {
-    signed: signed.whole, signature: bits(signature), issuer: hex(issuer.whole), subject: hex(subject.whole),
-    key: hex(bits(point)), from, until, names: [], authority: false, usage: null, size: element(der, 0).end,
-  }
-  const there = new Set()
-  for (const { content } of rest.filter((part) => part.tag === 0xa3)) {
-    for (const extension of members(members(content)[0].content)) {
-      const parts = members(extension.content)
-      const [id, value] = [hex(parts[0].content), element(parts.at(-1).content, 0)]
-      if (there.has(id)) throw new Wrong('untrusted', 'an extension is there twice')
-      there.add(id)
-      if (id === '551d13') found.authority = members(value.content).some((part) => part.tag === 1 && part.content[0])
-      else if (id === '551d0f') found.usage = bits(value)[0] // digitalSignature 80, nonRepudiation 40 … keyAgreement 08, keyCertSign 04
-      else if (id === '551d11') {
-        for (const name of members(value.content)) {
-          found.names.push(`${name.tag & 0x1f}:${Buffer.from(name.content).toString('latin1')}`)
-        }
-      } else if (!HARMLESS.has(id) && parts.length > 2 && parts[1].content[0]) {
-        throw new Wrong('untrusted', `a critical extension, ${id}`)
-      }
-    }
-  }
-  found.constrained = there.has('551d1e') // nameConstraints
-  found.purposes = there.has('551d25') // extendedKeyUsage
-  return found
-}
-
-// The first of two values, or all that there is where it is not two.
-function firstOf(certificates) {
+// What evidence.js makes of foreign bytes, or that they are wrong in this way.
+const read = (kind, make) => {
   try {
-    const { whole, end } = element(certificates, 0)
-    return element(certificates, end).end === certificates.length ? whole : certificates
-  } catch {
-    return certificates
+    return make()
+  } catch (error) {
+    throw new Wrong(kind, error.message)
   }
-}
-
-// The signing certificate of a registration, if the table of log.md (Certificates) holds for both and they had not ended
-// then. That they begin later than its block is a chain whose clock is behind.
-function signer(certificates, roots, robot, blockTime) {
-  const first = certificate(certificates)
-  const second = certificate(certificates.slice(first.size))
-  if (first.size + second.size !== certificates.length) throw new Wrong('untrusted', 'not two certificates')
-  const at = Math.max(blockTime * 1000, first.from, second.from)
-  const until = Math.min(first.until, second.until)
-  if (!(at <= until)) throw new Wrong('untrusted', 'had ended when they were registered')
-  for (const [made, own, others] of [[first, 0xc0, 0x38], [second, 0x08, 0xc0]]) {
-    const issued = (root) => root.subject === made.issuer && root.authority && !root.constrained &&
-      root.from <= at && at <= root.until && (root.usage === null || root.usage & 0x04) &&
-      holds(root.key, made.signed, made.signature, true)
-    if (!roots.some(issued)) throw new Wrong('untrusted', 'not signed by the CA')
-    if (made.names.join() !== `6:urn:rosbridge-eth:robot:${robot}`) throw new Wrong('untrusted', `for ${made.names}`)
-    if ((made.usage & own) !== own || made.usage & others || made.purposes) throw new Wrong('untrusted', 'for another use')
-    if (made.authority) throw new Wrong('untrusted', 'a CA itself')
-  }
-  return { ...first, from: Math.max(first.from, second.from), until }
 }
 
 // --- chunks
-
-function parse(data) {
-  if (data.length < FIXED + 64) throw new Wrong('malformed', `${data.length} bytes`)
-  let at = 0
-  const take = (size) => data.slice(at, (at += size))
-  const [version, flags] = take(2)
-  const header = {
-    goodbye: flags === 1, stream: take(16), number: number(take(8)), previous: hex(take(32)),
-    sealed: Number(number(take(8))), records: Number(number(take(4))), root: hex(take(32)),
-    bodyLength: Number(number(take(4))), bodyDigest: hex(take(32)), grants: [],
-  }
-  const [count] = take(1)
-  for (let n = 0; n < count; n++) header.grants.push(take(GRANT))
-  header.encoded = data.slice(0, at)
-  header.digest = hex(digest(header.encoded))
-  const signature = take(64)
-  const body = data.slice(at)
-  const empty = header.records === 0
-  const formed = version === 3 && flags <= 1 && signature.length === 64 && header.sealed < 253402300800000 &&
-    (body.length === 0 || body.length === header.bodyLength) && (empty
-    ? header.bodyLength === 0 && count === 0 && header.root === hex(digest()) && header.bodyDigest === hex(digest())
-    : header.records <= MAX.records && count >= 1 && count <= MAX.readers && header.bodyLength > 16 &&
-      header.bodyLength <= MAX.body && (header.bodyLength - 16) % 64 === 0)
-  if (!formed) throw new Wrong('malformed')
-  return { header, signature, body, bare: header.bodyLength > 0 && body.length === 0 }
-}
 
 function root(leaves) {
   let level = leaves
@@ -205,28 +78,24 @@ function contentKey(grants, readerKey) {
 }
 const expanded = (key, label) => hmac(key, join(text.encode(`rosbridge-eth/3 ${label}`), [1])) // HKDF-Expand, RFC 5869
 
-function open({ header, body }, log, readerKey) {
-  if (header.records === 0) return []
-  const place = join(header.stream, bigEndian(header.number, 8))
-  const key = contentKey(header.grants, readerKey)
+function open(chunk, log, readerKey) {
+  if (chunk.records === 0) return []
+  const key = contentKey(chunk.grants, readerKey)
   if (!key) throw new Wrong('no-grant')
-  let lines
-  try {
-    const plaintext = sm4.decrypt(body.slice(0, -16), expanded(key, 'body').slice(0, 16), {
-      mode: 'gcm', iv: new Uint8Array(12), associatedData: join(log, place), tag: body.slice(-16), output: 'array',
+  const lines = read('unopenable', () => {
+    const plaintext = sm4.decrypt(chunk.body.slice(0, -16), expanded(key, 'body').slice(0, 16), {
+      mode: 'gcm', iv: new Uint8Array(12), associatedData: join(log, chunk.place), tag: chunk.body.slice(-16), output: 'array',
     })
     const content = unpacked(plaintext)
     if (content.at(-1) !== 10 || content[0] === 10 || content.includes('\n\n')) throw new Error('an empty record')
-    lines = []
-    for (let at = 0, end; at < content.length; at = end + 1) lines.push(content.subarray(at, (end = content.indexOf(10, at))))
-  } catch (error) {
-    throw new Wrong('unopenable', error.message)
-  }
-  if (lines.length !== header.records) throw new Wrong('unopenable', 'another number of records')
+    const found = []
+    for (let at = 0, end; at < content.length; at = end + 1) found.push(content.subarray(at, (end = content.indexOf(10, at))))
+    return found
+  })
+  if (lines.length !== chunk.records) throw new Wrong('unopenable', 'another number of records')
   const saltKey = expanded(key, 'salts')
-  const salt = (n) => hmac(saltKey, bigEndian(n, 4)).slice(0, 16)
-  const found = root(lines.map((line, n) => digest([0], salt(n), line)))
-  if (found !== header.root) throw new Wrong('unopenable', 'another root')
+  const leaves = lines.map((line, n) => digest([0], hmac(saltKey, word(n, 4)).slice(0, 16), line))
+  if (root(leaves) !== hex(chunk.root)) throw new Wrong('unopenable', 'another root')
   return lines
 }
 
@@ -237,7 +106,7 @@ function unpacked(data) {
   const descriptor = data[4]
   const [single, checked, size] = [(descriptor >> 5) & 1, (descriptor >> 2) & 1, [0, 2, 4, 8][descriptor >> 6]]
   if (descriptor & 8) throw new Error('a reserved bit')
-  const little = (from, length) => number(data.slice(from, from + length).reverse())
+  const little = (from, length) => big(data.slice(from, from + length).reverse())
   let at = 5
   const [exponent, mantissa] = single ? [0, 0] : [10 + (data[at] >> 3), data[at++] & 7]
   let window = 2 ** exponent * (1 + mantissa / 8)
@@ -297,50 +166,6 @@ function xxh64(data) {
   return hash ^ (hash >> 32n)
 }
 
-// --- lines
-
-const STRING = String.raw`"[^"\\]*(?:\\.[^"\\]*)*"`
-const COUNT = String.raw`-?\d+`
-const FORMS = {
-  message: `{"topic":${STRING},"type":${STRING},"source":${STRING},"received_ns":${COUNT},"captured_ns":${COUNT},` +
-    '"clock":(true|false),"data":{.*}}',
-  type: `{"type":${STRING},"wire":${STRING},"format":${STRING},"definition":${STRING}}`,
-  lost: `{"lost":(${COUNT}),"topic":${STRING},"why":${STRING}}`,
-  trigger: `{"trigger":${STRING},"why":${STRING},"at_ns":${COUNT}}`,
-  stream: `{"stream":{"source":${STRING},"software":${STRING}}}`,
-}
-for (const kind in FORMS) FORMS[kind] = new RegExp(`^${FORMS[kind].replace(/[{}]/g, '\\$&')}$`, 's')
-const TOKEN = new RegExp(`${STRING}|[-+.\\w]+|[^]`, 'g')
-
-// Of which kind a line is, with what its form captures; an Error where it is not in its one form (docs/log.md, Records).
-function kindOf(line) {
-  const shown = line.toString('utf8')
-  const form = (holds) => {
-    if (!holds) throw new Error('not in the one form of a line')
-  }
-  form(line.length <= MAX.line && Buffer.from(shown).equals(line))
-  const open = [] // of each level, an object's names, or null for an array
-  const tokens = shown.match(TOKEN)
-  for (const [n, token] of tokens.entries()) {
-    if (token === '{' || token === '[') form(open.push(token === '{' ? new Set() : null) <= MAX.depth)
-    else if (token === '}' || token === ']') open.pop()
-    else if (token[0] === '"') {
-      const said = JSON.parse(token)
-      form(JSON.stringify(said) === token && !/\p{Cs}/u.test(said))
-      if (tokens[n + 1] === ':') form(open.at(-1) && !open.at(-1).has(said) && open.at(-1).add(said))
-    } else form(token.trim() && (!/[-\d]/.test(token[0]) || Number.isFinite(Number(token))))
-  }
-  const names = Object.keys(JSON.parse(shown)).join()
-  for (const kind in FORMS) {
-    const [match, captured] = FORMS[kind].exec(shown) ?? []
-    if (!match || (kind === 'message' && names !== 'topic,type,source,received_ns,captured_ns,clock,data')) continue
-    const counts = [...shown.matchAll(/"(?:received_ns|captured_ns|lost|at_ns)":(-?\d+)/g)]
-    form(counts.slice(0, kind === 'message' ? 2 : 1).every(([, count]) => BigInt(count) >= 0n && BigInt(count) < 2n ** 63n))
-    return { kind, captured, shown }
-  }
-  throw new Error('no line of these kinds')
-}
-
 // --- the reading
 
 const { values: options } = parseArgs({
@@ -355,9 +180,8 @@ const provider = new JsonRpcProvider(options.node, undefined, { staticNetwork: t
 const contract = new Contract(options.contract, ABI, provider)
 const { chainId } = await provider.getNetwork()
 const genesis = (await provider.getBlock(0)).hash
-const tk = keccakOfText(options.robot)
-const ledger = digest(bigEndian(chainId, 32), getBytes(genesis), getBytes(options.contract))
-const log = join(ledger, getBytes(tk))
+const log = logOf(chainId, getBytes(genesis), getBytes(options.contract), options.robot)
+const tk = '0x' + hex(log.slice(32))
 const block = await provider.getBlockNumber()
 const [standing] = await contract.standings([tk], { blockTag: block })
 const end = Number(standing.chunks)
@@ -374,6 +198,16 @@ const eventsIn = async (names, from, to) => {
   const found = []
   for (const name of names) found.push(...(await contract.queryFilter(contract.filters[name](tk), from, to)))
   return found.sort((a, b) => a.blockNumber - b.blockNumber || a.index - b.index)
+}
+
+// The first of two values, or all that there is where it is not two.
+function firstOf(certificates) {
+  try {
+    const { whole } = element(certificates)
+    return whole.length + element(certificates, whole.length).whole.length === certificates.length ? whole : certificates
+  } catch {
+    return certificates
+  }
 }
 
 // Registrations, from the newest back by their links.
@@ -399,12 +233,12 @@ whole &&= linked.hash === standing.certificatesHash && linked.revoked === standi
 if (!whole || linked.block !== Number(standing.changedBlock)) told('withheld', end, 'a registration')
 const signers = []
 for (const event of registrations) {
-  const one = { index: Number(event.args.index), block: event.blockNumber, revoked: event.eventName === 'Revoked' }
+  const one = { index: Number(event.args.index), block: event.blockNumber, revoked: event.eventName === 'Revoked', fingerprint: '' }
   if (!one.revoked) {
     const certificates = getBytes(event.args.certificates)
     one.fingerprint = hex(digest(firstOf(certificates)))
     try {
-      Object.assign(one, signer(certificates, roots, options.robot, await timeOf(event.blockNumber)))
+      Object.assign(one, signer(certificates, roots, options.robot, 1000 * (await timeOf(event.blockNumber))))
     } catch (error) {
       one.why = error.message
     }
@@ -415,66 +249,66 @@ for (const event of registrations) {
 // One pass over the chunks. head is the robot's newest; seen the digests of all, to tell a fork from a hole.
 let head = null
 let records = 0
-const seen = new Map()
+const seen = new Set()
 const withoutBody = new Set() // of which only the dropped form was read
 
-function follow(header, at) {
-  const stream = hex(header.stream)
-  const same = head !== null && stream === head.stream
-  const ahead = header.number - (same ? head.number + 1n : 0n)
-  const follows = header.previous === (head === null ? ZEROS : head.digest)
-  const knowsNone = !same && header.number === 0n && header.previous === ZEROS
-  if (seen.has(header.digest)) throw new Wrong('forked', `the chunk of index ${seen.get(header.digest)} once more`)
-  if (ahead !== 0n || !(follows || knowsNone)) {
-    if (seen.has(header.previous) || (same && ahead <= 0n)) told('forked', at)
+function follow(chunk, at) {
+  const same = head !== null && chunk.stream === head.stream
+  const ahead = chunk.number - (same ? head.number + 1n : 0n)
+  const follows = chunk.previous === (head === null ? ZEROS : head.digest)
+  const knowsNone = !same && chunk.number === 0n && chunk.previous === ZEROS
+  const goesBack = head !== null && (same ? head.goodbye : chunk.stream < head.stream)
+  if (seen.has(chunk.digest)) throw new Wrong('forked', 'a chunk that was read before, once more')
+  if (ahead !== 0n || goesBack || !(follows || knowsNone)) {
+    if (goesBack || seen.has(chunk.previous) || (same && ahead <= 0n)) told('forked', at)
     else told('missing', at, '', Number(ahead) || 1)
   }
   if (head !== null && !same && (knowsNone || !head.goodbye)) told('restarted', at)
-  if (head !== null && header.sealed < head.sealed - 1000) told('clock', at, 'sealed before the chunk it follows')
-  seen.set(header.digest, at)
-  head = { stream, number: header.number, digest: header.digest, sealed: header.sealed, goodbye: header.goodbye }
+  if (head !== null && chunk.sealed < head.sealed - 1000) told('clock', at, 'sealed before the chunk it follows')
+  seen.add(chunk.digest)
+  head = chunk
 }
 
 async function prove(data, at, event) {
-  const chunk = parse(data)
-  const { header } = chunk
+  const chunk = read('malformed', () => chunkOf(data))
   const governing = signers.findLast((one) => one.index <= at)
   if (!governing?.key) throw new Wrong('untrusted', governing?.why ?? (governing ? 'revoked' : 'not registered'))
-  const signed = join(text.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, header.encoded)
-  if (!holds(governing.key, signed, chunk.signature, false)) throw new Wrong('forged')
-  if (header.sealed > governing.until) throw new Wrong('untrusted', "sealed after the certificate's end")
+  if (!isSigned(chunk, log, governing.key)) throw new Wrong('forged')
+  if (chunk.sealed > governing.until) throw new Wrong('untrusted', "sealed after the certificate's end")
   const time = await timeOf(event.blockNumber)
-  const altered = !chunk.bare && hex(digest(chunk.body)) !== header.bodyDigest
-  const restored = !chunk.bare && !altered && header.previous !== head?.digest && withoutBody.delete(header.digest)
+  const altered = !chunk.bare && chunk.body.length > 0 && hex(digest(chunk.body)) !== chunk.bodyDigest
+  const restored = !chunk.bare && !altered && chunk.previous !== head?.digest && withoutBody.delete(chunk.digest)
   if (!restored) {
-    follow(header, at)
-    if (chunk.bare) withoutBody.add(header.digest)
-    if (header.sealed > time * 1000 + 300000) told('clock', at, 'sealed later than its block')
-    if (header.sealed < governing.from) told('clock', at, "sealed before the robot's certificate began")
+    follow(chunk, at)
+    if (chunk.bare) withoutBody.add(chunk.digest)
+    if (chunk.sealed > time * 1000 + 300000) told('clock', at, 'sealed later than its block')
+    if (chunk.sealed < governing.from) told('clock', at, "sealed before the robot's certificate began")
   }
-  if (chunk.bare) return told('dropped', at, '', header.records)
+  if (chunk.bare) return told('dropped', at, '', chunk.records)
   if (altered) throw new Wrong('altered')
-  if (!options.key) return header.records && told('no-grant', at, '', header.records)
+  if (!options.key) return chunk.records && told('no-grant', at, '', chunk.records)
   let unsynchronised = 0
   for (const [n, line] of open(chunk, log, options.key).entries()) {
     let found
+    const shown = line.toString('utf8')
     try {
-      found = kindOf(line)
+      if (!Buffer.from(shown).equals(line)) throw new Error('it is not UTF-8')
+      found = lineOf(shown)
     } catch (error) {
       told('unopenable', at, `line ${n}: ${error.message}`)
       continue
     }
-    if (found.kind === 'lost') told('lost', at, '', Number(found.captured))
+    if (found.kind === 'lost') told('lost', at, '', Number(found.content.lost))
     if (found.kind === 'trigger') told('triggered', at)
     if (found.kind !== 'message') continue
-    unsynchronised += found.captured === 'false'
+    unsynchronised += !found.content.clock
     const proof = {
-      chunk: at, record: n, stream: hex(header.stream), number: Number(header.number), digest: header.digest,
-      sealed: new Date(header.sealed).toISOString(), block: event.blockNumber,
+      chunk: at, record: n, stream: chunk.stream, number: Number(chunk.number), digest: chunk.digest,
+      sealed: new Date(chunk.sealed).toISOString(), block: event.blockNumber,
       block_time: new Date(time * 1000).toISOString(), transaction: event.transactionHash,
     }
     // The line itself and not what was parsed of it: JavaScript's numbers would lose digits of the times.
-    process.stdout.write(`${printable(found.shown).slice(0, -1)},"proof":${JSON.stringify(proof)}}\n`)
+    process.stdout.write(`${printable(shown).slice(0, -1)},"proof":${JSON.stringify(proof)}}\n`)
     records += 1
   }
   if (unsynchronised) told('clock', at, 'messages captured while it was not synchronised', unsynchronised)
@@ -495,7 +329,7 @@ for (let from = registrations[0]?.blockNumber ?? 0; from <= Number(standing.data
         await prove(getBytes(encoded), at, event)
       } catch (error) {
         if (!(error instanceof Wrong)) throw error
-        told(error.kind, at, error.message, error.kind === 'no-grant' ? parse(getBytes(encoded)).header.records : 1)
+        told(error.kind, at, error.message, error.kind === 'no-grant' ? chunkOf(getBytes(encoded)).records : 1)
       }
     }
   }
@@ -508,7 +342,7 @@ const counts = {}
 for (const { kind, count } of findings) counts[kind] = (counts[kind] ?? 0) + count
 const verdict = {
   robot: options.robot, sound, chunks: end, block, records, counts,
-  head: head && { ...head, number: Number(head.number) },
+  head: head && { stream: head.stream, number: Number(head.number), digest: head.digest, sealed: head.sealed, goodbye: head.goodbye },
   certificates: signers.map(({ index, revoked, fingerprint, key }) => ({ index, revoked, fingerprint, trusted: Boolean(key) })),
   findings,
 }

@@ -44,7 +44,7 @@ class IdentityError(BridgeError, exit_code=ExitCode.IDENTITY):
 
 
 class StoreError(BridgeError, exit_code=ExitCode.STORE):
-    """The spool, inbox or journal cannot be opened or written, or belongs to another chain."""
+    """A robot's or the server's store, or the registry, cannot be opened or written."""
 
 
 class NetworkError(BridgeError, exit_code=ExitCode.NETWORK):

@@ -9,7 +9,7 @@ to say who somebody is.
 Every signature covers `"rosbridge-eth/2 " ‖ purpose ‖ 0x00 ‖ body`, so that
 one made for a purpose means nothing for another.
 
-Not here: how certificates travel (channel), what is encrypted to whom (sealing).
+Not here: how certificates travel (channel), what is encrypted for whom (log.chunk).
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class PeerIdentity:
     @property
     def certificates(self) -> bytes:
         """Both in DER, signing first: how they stand in a robot's registration on the chain."""
-        return self.signing_certificate.to_der() + self.encryption_certificate.to_der()
+        return b"".join(self.pair)
 
     @property
     def pair(self) -> tuple[bytes, bytes]:

@@ -58,7 +58,7 @@ def test_a_worker_whose_registry_is_gone_ends_and_says_so(
     [sock] = server_sockets(("127.0.0.1", 0))
     reception = open_reception(
         0, load_server_config(world.home.config), load_server_identity(world.home, PASSPHRASE), world.home,
-        Registry(world.home.registry), world.open_inbox(), world.home.deployment(),
+        Registry(world.home.registry), world.open_store(), world.home.deployment(),
     )  # fmt: skip
     serving = Running(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)))
     try:
@@ -84,7 +84,7 @@ def test_a_submitter_writes_for_nobody(world: World, harm: Harm, said: str) -> N
     world.register()
     world.hand_over(1)
     submitter = open_submitter(
-        load_server_config(world.home.config), world.ledger, world.open_inbox(), Registry(world.home.registry),
+        load_server_config(world.home.config), world.ledger, world.open_store(), Registry(world.home.registry),
         world.keys,
     )  # fmt: skip
     harm(world)

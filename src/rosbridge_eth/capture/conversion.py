@@ -31,18 +31,13 @@ import orjson
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from rosbridge_eth.capture.definitions import DURATION, TIME, attribute_name
+from rosbridge_eth.capture.definitions import DURATION, NUMBERS, TIME, attribute_name
 from rosbridge_eth.capture.messages import Decoder, Wire
 from rosbridge_eth.capture.rules import DEFAULT_LIMIT, Selection
 from rosbridge_eth.errors import ConfigError
 from smcrypto import sm3
 
 BYTES: Final = frozenset({"uint8", "char", "byte"})
-NUMPY: Final = {"bool": "?", "byte": "i1", "char": "u1"} | {
-    f"{kind}{bits}": f"<{letter}{bits // 8}"
-    for kind, letter in (("int", "i"), ("uint", "u"), ("float", "f"))
-    for bits in (8, 16, 32, 64)
-}
 
 
 class Conversion:
@@ -157,7 +152,7 @@ class Conversion:
         return convert
 
     def _numbers(self, base: str, path: str) -> Callable[[Any], Any]:
-        wire = numpy.dtype(NUMPY[base])
+        wire = NUMBERS[base]
         longest, binary, real = self._limit // wire.itemsize, base in BYTES, base in ("float32", "float64")
 
         def convert(value: Any) -> Any:

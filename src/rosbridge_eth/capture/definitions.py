@@ -10,9 +10,9 @@ Before rosbags parses a text (MSG: wiki.ros.org/msg; IDL: OMG IDL 4.2, 7.4): com
 its time grows with the square of their number; its length, fields and nesting are bounded; and of IDL, annotations,
 expressions and sequences of sequences are gone or refused, on which it takes exponential time, or another type.
 
-Refused after it: a type that is missing, contains itself or is nested too deeply (rosbags would recurse), a
-type that doubles at every level, a fixed array that unrolls into too much code, arrays of elements that take no bytes
-(a count of 2**32 would cost no data), and a definition too long for a line of the log.
+Refused after it: a type that is missing, contains itself or is nested too deeply (rosbags would recurse), one that
+comes to too many fields or bytes with all that is in it, arrays of elements that take no bytes (a count of 2**32 would
+cost no data), and a definition too long for a line of the log.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
-from typing import Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
+import numpy
 import orjson
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import Constdefs, Fielddefs, FieldDesc, Typesdict
@@ -39,18 +40,17 @@ MAX_TEXT = 256 * 1024
 """Characters of one definition with everything it refers to; moveit's largest have about 60,000."""
 MAX_KEPT = 48 * 1024
 """Bytes of a definition without its comments: it has to fit into a line of the log."""
-MAX_TYPES = 256
 MAX_FIELDS = 1024
-"""Fields of all types of one definition together; rosbags needs about a millisecond for each."""
+"""Types and their fields in one definition, together; rosbags needs about a millisecond for each."""
 MAX_LEAVES = 8192
-"""Fields of one message with those of the messages in it, an array counting once."""
+"""Fields of one message with those of the messages in it: the code that is generated for it has a line for each.
+
+A fixed array of strings or messages counts all its elements, since rosbags unrolls it; other arrays count as one.
+"""
 MAX_DEPTH = 32
 MAX_NAME = 128
-MAX_UNROLLED = 1024
-"""Elements of fixed arrays of strings or messages, together: rosbags writes a line of code for each."""
-MAX_FIXED_BYTES = 1 << 20
-"""Bytes of one fixed array of numbers."""
-MAX_COUNT = 2**32 - 1
+MAX_SMALLEST = 1 << 20
+"""Bytes of the shortest message, fixed arrays included."""
 
 TIME = "builtin_interfaces/msg/Time"
 DURATION = "builtin_interfaces/msg/Duration"
@@ -61,12 +61,11 @@ _BUILTIN: dict[str, Fielddefs] = {
 }
 _ROS1_NAMES = {TIME: "time", DURATION: "duration"}
 
-SIZES = {
-    "bool": 1, "byte": 1, "char": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2,
-    "int32": 4, "uint32": 4, "int64": 8, "uint64": 8, "float32": 4, "float64": 8,
-}  # fmt: skip
-"""Bytes on the wire of the built-in types; a string takes 4 for its length, then its bytes."""
-_BASES = SIZES.keys() | {"string"}
+NUMBERS: Final[dict[str, numpy.dtype[Any]]] = {name: numpy.dtype(code) for name, code in {
+    "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2",
+    "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8", "float32": "<f4", "float64": "<f8",
+}.items()}  # fmt: skip
+"""The built-in types but strings, as they are on the wire."""
 _UNSUPPORTED = {"wstring", "wchar", "float128", "fixed"}
 EMPTY_MESSAGE_FIELD = "structure_needs_at_least_one_member"
 """rosidl's and rosbags' name for the byte that stands for a message without fields."""
@@ -92,7 +91,7 @@ _BEYOND_IDL = re.compile(rf"<<|sequence ?< ?(?:[\w:]+ ?< ?[^<>]*<|sequence\b)|(?
 _PARSER_ERRORS = (
     TypesysError, ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
 )  # fmt: skip
-"""In what rosbags' parsers end on what is no definition."""
+"""What rosbags' parsers raise for a text that is no definition."""
 
 
 class DefinitionError(SourceError):
@@ -152,8 +151,6 @@ def read_definition(type_name: str, text: str, format: Format = "msg") -> Defini
     except _PARSER_ERRORS as error:
         why = _shown(str(error).split("\n", 3)[-1])  # of rosbags' lines, the place where it ended
         raise DefinitionError(f"the definition of {name} cannot be read: {why}") from None
-    if unnamed := [each for each in types if normalised_type_name(each) != each]:
-        raise DefinitionError(f"{_shown(unnamed[0])} is not a message type's full name")
     fields = {each: own for each, (_, own) in types.items()}
     return check_types(name, fields, kept, {each: constants for each, (constants, _) in types.items()})
 
@@ -182,8 +179,8 @@ def _idl_types(text: str) -> Typesdict:
     scopes = accumulate((char == "{") - (char == "}") for char in plain)
     if not _PLAIN_IDL.fullmatch(plain) or _BEYOND_IDL.search(plain) or max(scopes, default=0) > MAX_SCOPES:
         raise ValueError("expressions, nested sequences and deeper scopes of IDL are not supported")
-    if plain.count(";") + plain.count(",") > MAX_FIELDS + MAX_TYPES:
-        raise ValueError(f"it has more than {MAX_FIELDS + MAX_TYPES} declarations")
+    if plain.count(";") + plain.count(",") > MAX_FIELDS:
+        raise ValueError(f"it has more than {MAX_FIELDS} declarations")
     types = get_types_from_idl(plain.replace(">>", "> >"))  # which it takes for a shift
     if len(types) < len(re.findall(r"\bstruct\b", plain)):
         raise ValueError("a struct is defined twice")
@@ -191,11 +188,7 @@ def _idl_types(text: str) -> Typesdict:
 
 
 def _check_length(name: str, text: str) -> None:
-    try:
-        length = len(orjson.dumps(text))
-    except orjson.JSONEncodeError:
-        raise DefinitionError(f"the definition of {name} is not text") from None
-    if length > MAX_KEPT:
+    if len(orjson.dumps(text)) > MAX_KEPT:
         raise DefinitionError(f"the definition of {name} is longer than {MAX_KEPT} bytes without its comments")
 
 
@@ -207,44 +200,43 @@ def check_types(
 
     text: what it was parsed from; without it, the text is written from the tree.
     """
-    if len(types) > MAX_TYPES:
-        raise DefinitionError(f"the definition of {type_name} brings {len(types)} types; at most {MAX_TYPES}")
-    if sum(len(fields) for fields in types.values()) > MAX_FIELDS:
-        raise DefinitionError(f"the definition of {type_name} has more than {MAX_FIELDS} fields")
+    if len(types) + sum(map(len, types.values())) > MAX_FIELDS:
+        raise DefinitionError(f"the definition of {type_name} has more than {MAX_FIELDS} types and fields")
     for name, standard in _BUILTIN.items():
         if name in types and list(types[name]) != standard:
             raise DefinitionError(f"the definition of {type_name} redefines {name}")
     checker = _Checker({**types, **_BUILTIN})
-    checker.visit(type_name, 0)
+    checker.visit(type_name)
     text = write_text(type_name, checker.done) if text is None else text
     _check_length(type_name, text)
-    return Definition(type_name, checker.done, checker.smallest, text, constants or {})
+    smallest = {name: size for name, (size, _) in checker.sizes.items()}
+    return Definition(type_name, checker.done, smallest, text, constants or {})
 
 
 class _Checker:
-    """Walks a tree from its root, depth first; `done` is in an order where parts precede wholes."""
+    """Walks a tree from its root, depth first; `done` is in an order where parts precede wholes.
+
+    sizes: of each type the bytes of its shortest message, and its fields as MAX_LEAVES counts them.
+    """
 
     def __init__(self, types: Mapping[str, Fielddefs]) -> None:
         self.types = types
         self.done: dict[str, Fielddefs] = {}
-        self.smallest: dict[str, int] = {}
-        self.unrolled = 0
-        self._leaves: dict[str, int] = {}
-        self._open: set[str] = set()
+        self.sizes: dict[str, tuple[int, int]] = {}
+        self._within: list[str] = []
 
-    def visit(self, name: str, depth: int) -> int:
-        """Bytes that the shortest message of type `name` takes."""
-        if name in self.smallest:
-            return self.smallest[name]
+    def visit(self, name: str) -> tuple[int, int]:
+        if name in self.sizes:
+            return self.sizes[name]
         if normalised_type_name(name) != name:
             raise DefinitionError(f"{_shown(name)} is not a message type's full name")
-        if name in self._open:
+        if name in self._within:
             raise DefinitionError(f"message type {name} contains itself")
-        if depth > MAX_DEPTH:
+        if len(self._within) > MAX_DEPTH:
             raise DefinitionError(f"message types are nested more than {MAX_DEPTH} deep at {name}")
         if name not in self.types:
             raise DefinitionError(f"message type {name} is used but not defined")
-        self._open.add(name)
+        self._within.append(name)
         # A message without fields is padded with one byte by ROS 2, and rosbags says so in its own definitions.
         fields = [field for field in self.types[name] if field[0] != EMPTY_MESSAGE_FIELD]
         seen: set[str] = set()
@@ -252,52 +244,42 @@ class _Checker:
         for field, description in fields:
             if not _FIELD_NAME.fullmatch(field) or len(field) > MAX_NAME:
                 raise DefinitionError(f"message type {name} has a field {_shown(field)}, which is not a name")
-            attribute = attribute_name(field)
-            if attribute in seen:
+            if (attribute := attribute_name(field)) in seen:
                 raise DefinitionError(f"message type {name} has field {field} twice")
             seen.add(attribute)
-            size += self._field(f"{name}.{field}", description, depth)
-            leaves += self._leaves.get(referred(description) or "", 0) + 1
-        if leaves > MAX_LEAVES:
-            raise DefinitionError(f"message type {name} comes to more than {MAX_LEAVES} fields, all within it counted")
-        self._open.discard(name)
-        self.done[name], self.smallest[name], self._leaves[name] = fields, size, leaves
-        return size
+            own_size, own_leaves = self._field(f"{name}.{field}", description)
+            size, leaves = size + own_size, leaves + own_leaves + 1
+        if leaves > MAX_LEAVES or size > MAX_SMALLEST:
+            raise DefinitionError(
+                f"message type {name} comes to more than {MAX_LEAVES} fields or {MAX_SMALLEST} bytes with all within it"
+            )
+        self._within.pop()
+        self.done[name], self.sizes[name] = fields, (size, leaves)
+        return size, leaves
 
-    def _refuse_unsupported(self, where: str, kind: str) -> None:
-        if kind in _UNSUPPORTED:
-            raise DefinitionError(f"{where} is a {kind}, not supported: its wire form differs between middlewares")
-
-    def _field(self, where: str, description: FieldDesc, depth: int) -> int:
-        if description[0] == Nodetype.BASE:
-            name, bound = description[1]
-            if not 0 <= bound <= MAX_COUNT:
-                raise DefinitionError(f"{where} has a length out of range: {bound}")
-            self._refuse_unsupported(where, name)
-            if name not in _BASES:
-                raise DefinitionError(f"{where} has the unknown type {_shown(name)}")
-            return SIZES.get(name, 4)
+    def _field(self, where: str, description: FieldDesc) -> tuple[int, int]:
+        if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            return self._array(where, *description[1], fixed=description[0] == Nodetype.ARRAY)
+        name = description[1][0] if description[0] == Nodetype.BASE else description[1]
+        plain = name.rpartition("/")[2]
+        if plain in _UNSUPPORTED and name not in self.types:  # in MSG, rosbags takes a wstring for a message type
+            raise DefinitionError(f"{where} is a {plain}, not supported: its wire form differs between middlewares")
         if description[0] == Nodetype.NAME:
-            if description[1] not in self.types:  # rosbags takes a wstring in MSG for a message type
-                self._refuse_unsupported(where, description[1].rpartition("/")[2])
-            return self.visit(description[1], depth + 1)
-        element, count = description[1]
-        if not 0 <= count <= MAX_COUNT:
-            raise DefinitionError(f"{where} has an array length out of range: {count}")
-        size = self._field(where, element, depth)
+            return self.visit(name)
+        if name != "string" and name not in NUMBERS:
+            raise DefinitionError(f"{where} has the unknown type {_shown(name)}")
+        return 4 if name == "string" else NUMBERS[name].itemsize, 0  # a string's length, then its bytes
+
+    def _array(self, where: str, element: FieldDesc, count: int, *, fixed: bool) -> tuple[int, int]:
+        size, leaves = self._field(where, element)
         if size == 0:
             raise DefinitionError(f"{where} is an array of empty messages")
-        if description[0] == Nodetype.SEQUENCE:
-            return 4
-        if count == 0:
-            raise DefinitionError(f"{where} is a fixed array of no elements")
-        if element[0] == Nodetype.NAME or element[1][0] == "string":
-            self.unrolled += count
-            if self.unrolled > MAX_UNROLLED:
-                raise DefinitionError(f"{where}: more than {MAX_UNROLLED} elements in fixed arrays of this kind")
-        elif count * size > MAX_FIXED_BYTES:
-            raise DefinitionError(f"{where} is a fixed array of {count * size} bytes; at most {MAX_FIXED_BYTES}")
-        return count * size
+        if not fixed:
+            return 4, leaves
+        if count < 1:
+            raise DefinitionError(f"{where} is a fixed array of {count} elements")
+        unrolled = element[0] == Nodetype.NAME or element[1][0] == "string"
+        return count * size, count * max(leaves, 1) if unrolled else 0
 
 
 def attribute_name(field: str) -> str:

@@ -8,27 +8,22 @@ its definition, but for the `seq` of a header, which only ROS 1 has.
 from __future__ import annotations
 
 from base64 import b64decode
-from collections.abc import Callable, Mapping
-from functools import cached_property, partial
-from typing import Any, Final, NamedTuple, TypeAlias
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import numpy
 from rosbags.interfaces import Nodetype
 from rosbags.interfaces.typing import FieldDesc
 
-from rosbridge_eth.capture.conversion import BYTES, NUMPY
-from rosbridge_eth.capture.definitions import DURATION, HEADER, TIME, check_types, write_text
+from rosbridge_eth.capture.conversion import BYTES
+from rosbridge_eth.capture.definitions import DURATION, HEADER, NUMBERS, TIME, check_types, write_text
 from rosbridge_eth.capture.messages import Decoder, Wire
 from rosbridge_eth.errors import SourceError, VerificationError
 
 _SECOND: Final = 10**9
 _UINT32: Final = 2**32
 NOT_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
-
-Builder: TypeAlias = Callable[[Any, list[str]], Any]
-"""Takes the JSON value (or _ABSENT) and the list to which paths of what is missing are added."""
-
-
 _ABSENT: Final = object()
 """Stands for a value that was not captured."""
 
@@ -52,16 +47,12 @@ class Restoration:
         if (wire or captured.wire) is Wire.ROS1 and any("/msg/" not in name for name in captured.fields):
             raise VerificationError(f"{captured.type_name}: ROS 1 has no messages of actions and services")
         self.decoder = captured if wire in (None, captured.wire) else _rewired(captured, wire)
-        # Of a header, what may stand in the data beside its fields, and what need not.
-        rewired = self.decoder is not captured
-        self._foreign = {"seq"} if rewired and self.decoder.wire is Wire.CDR else set()
-        self._new = {"seq"} if rewired and self.decoder.wire is Wire.ROS1 else set()
-        self._build = self._message(captured.type_name, "")
+        self._rewired = self.decoder is not captured
 
     def restore(self, data: Mapping[str, Any]) -> Restored:
         """The message of a record's data; VerificationError if the data does not fit the type."""
-        missing: list[str] = []
-        message = self._build(data, missing)
+        missing: dict[str, None] = {}
+        message = self._message(self.decoder.type_name, data, "", missing)
         return Restored(message, tuple(missing))
 
     @cached_property
@@ -72,105 +63,61 @@ class Restoration:
             return {"msgdef": definition.text, "md5sum": definition.md5}
         return {"msgdef": definition.text, "rihs01": self.decoder.typestore.hash_rihs01(definition.type_name)}
 
-    def _message(self, type_name: str, path: str) -> Builder:
-        make = self.decoder.typestore.types[type_name]
-        members = [
-            (name, self._value(description, f"{path}.{name}" if path else name))
-            for name, description in self.decoder.fields[type_name]
-        ]
-        foreign, new = (self._foreign, self._new) if type_name == HEADER else (set(), set())
-        names = {name for name, _ in members} | foreign
+    def _message(self, type_name: str, data: Any, path: str, missing: dict[str, None]) -> Any:
+        fields = dict(self.decoder.fields[type_name])
+        if self._rewired and type_name == HEADER and isinstance(data, dict):  # `seq` is ROS 1's alone
+            data = {"seq": 0, **data} if "seq" in fields else {name: data[name] for name in data if name != "seq"}
+        if not isinstance(data, dict) or not data.keys() <= fields.keys():
+            raise _unfit(path or type_name, data)
+        return self.decoder.typestore.types[type_name](*[
+            self._field(description, data.get(name, _ABSENT), f"{path}.{name}" if path else name, missing)
+            for name, description in fields.items()
+        ])  # fmt: skip
 
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT:
-                missing.append(path)
-                return make(*[builder(_ABSENT, []) for _, builder in members])
-            if not isinstance(data, dict) or not data.keys() <= names:
-                raise _unfit(path or type_name, data)
-            return make(
-                *[builder(data.get(name, _ABSENT), [] if name in new else missing) for name, builder in members]
-            )
-
-        return build
-
-    def _value(self, description: FieldDesc, path: str) -> Builder:
-        if description[0] == Nodetype.BASE:
-            if description[1][0] == "string":
-                return _leaf(path, str, partial(_exactly, str), _is_digest)
-            kind = numpy.dtype(NUMPY[description[1][0]])
-            # A byte is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed.
-            read = _signed if description[1][0] == "byte" else partial(_checked, kind)
-            return _leaf(path, lambda: kind.type(0).item(), read)
-        if description[0] == Nodetype.NAME:
-            if description[1] in (TIME, DURATION):
-                return self._instant(description[1], path)
-            return self._message(description[1], path)
-        element, count = description[1]
-        length = count if description[0] == Nodetype.ARRAY else None
-        if element[0] == Nodetype.BASE and element[1][0] != "string":
-            return self._numbers(element[1][0], length, path)
-        return self._list(self._value(element, f"{path}[*]"), length, path)
-
-    def _numbers(self, base: str, length: int | None, path: str) -> Builder:
-        kind, binary = numpy.dtype(NUMPY[base]), base in BYTES
-
-        def read(data: Any) -> Any:
-            if binary:
-                array = numpy.frombuffer(b64decode(data, validate=True), kind)
-            else:
-                array = numpy.array([_checked(kind, item) for item in _exactly(list, data)], kind)
-            if length is not None and len(array) != length:
-                raise ValueError
-            return array
-
-        # In place of numbers, single elements may stand in an object.
-        stands_in = _is_digest if binary else lambda data: isinstance(data, dict)
-        return _leaf(path, lambda: numpy.zeros(length or 0, kind), read, stands_in)
-
-    def _list(self, builder: Builder, length: int | None, path: str) -> Builder:
-        def build(data: Any, missing: list[str]) -> Any:
-            if data is _ABSENT or isinstance(data, dict):  # a digest, or single elements
-                missing.append(path)
-                return [builder(_ABSENT, []) for _ in range(length or 0)]
-            if not isinstance(data, list) or (length is not None and len(data) != length):
-                raise _unfit(path, data)
-            below: list[str] = []
-            items = [builder(item, below) for item in data]
-            missing.extend(dict.fromkeys(below))
-            return items
-
-        return build
-
-    def _instant(self, type_name: str, path: str) -> Builder:
-        make = self.decoder.typestore.types[type_name]
-        unsigned = self.decoder.wire is Wire.ROS1 and type_name == TIME
-        first = 0 if unsigned else -_UINT32 // 2
-
-        def read(data: Any) -> Any:
-            seconds, nanoseconds = divmod(_exactly(int, data), _SECOND)
-            if not first <= seconds < first + _UINT32:
-                raise ValueError
-            # rosbags writes the seconds as int32: the same 32 bits as ROS 1's uint32.
-            return make((seconds + _UINT32 // 2) % _UINT32 - _UINT32 // 2, nanoseconds)
-
-        return _leaf(path, lambda: make(0, 0), read)
-
-
-def _leaf(
-    path: str, zero: Callable[[], Any], read: Callable[[Any], Any], stands_in: Callable[[Any], bool] | None = None
-) -> Builder:
-    """The builder of a field without fields. stands_in: whether what is there is not the value, but in its place."""
-
-    def build(data: Any, missing: list[str]) -> Any:
-        if data is _ABSENT or (stands_in is not None and stands_in(data)):
-            missing.append(path)
-            return zero()
+    def _field(self, description: FieldDesc, data: Any, path: str, missing: dict[str, None]) -> Any:
+        is_message = description[0] == Nodetype.NAME and description[1] not in (TIME, DURATION)
+        # Otherwise an object stands for the value: a digest, or single elements.
+        if data is _ABSENT or (isinstance(data, dict) and not is_message):
+            missing[path] = None
+            return self._zero(description)
         try:
-            return read(data)
+            if description[0] == Nodetype.NAME:
+                if is_message:
+                    return self._message(description[1], data, path, missing)
+                return self._instant(description[1], _exactly(int, data))
+            if description[0] == Nodetype.BASE:
+                return _scalar(description[1][0], data)
+            element, count = description[1]
+            if _is_numeric(element):
+                items = _numbers(element[1][0], data)
+            else:
+                items = [self._field(element, item, f"{path}[*]", missing) for item in _exactly(list, data)]
+            if description[0] == Nodetype.ARRAY and len(items) != count:
+                raise ValueError
         except (TypeError, ValueError):
             raise _unfit(path, data) from None
+        return items
 
-    return build
+    def _zero(self, description: FieldDesc) -> Any:
+        if description[0] == Nodetype.NAME:
+            parts = [self._zero(part) for _, part in self.decoder.fields[description[1]]]
+            return self.decoder.typestore.types[description[1]](*parts)
+        if description[0] == Nodetype.BASE:
+            return "" if description[1][0] == "string" else NUMBERS[description[1][0]].type(0).item()
+        element, count = description[1]
+        length = count if description[0] == Nodetype.ARRAY else 0
+        if _is_numeric(element):
+            return numpy.zeros(length, NUMBERS[element[1][0]])
+        return [self._zero(element) for _ in range(length)]
+
+    def _instant(self, type_name: str, value: int) -> Any:
+        seconds, nanoseconds = divmod(value, _SECOND)
+        first = 0 if self.decoder.wire is Wire.ROS1 and type_name == TIME else -_UINT32 // 2
+        if not first <= seconds < first + _UINT32:
+            raise ValueError
+        # rosbags writes the seconds as int32: the same 32 bits as ROS 1's uint32.
+        seconds = (seconds + _UINT32 // 2) % _UINT32 - _UINT32 // 2
+        return self.decoder.typestore.types[type_name](seconds, nanoseconds)
 
 
 def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
@@ -187,18 +134,23 @@ def _rewired(captured: Decoder, wire: Wire | None) -> Decoder:
         raise VerificationError(f"{captured.type_name} cannot be written as {wire}: {error}") from None
 
 
+# The value of a field of a built-in type, or ValueError or TypeError
+
+
 def _exactly(kind: type, data: Any) -> Any:
     if type(data) is not kind:
         raise TypeError
     return data
 
 
-def _signed(data: Any) -> Any:
-    return data - 256 if type(data) is int and 127 < data < 256 else _checked(numpy.dtype("i1"), data)
+def _is_numeric(element: FieldDesc) -> bool:
+    return element[0] == Nodetype.BASE and element[1][0] != "string"
 
 
-def _checked(kind: numpy.dtype[Any], data: Any) -> Any:
-    """The number, if it is one of this kind; else ValueError or TypeError."""
+def _scalar(base: str, data: Any) -> Any:
+    if base == "string":
+        return _exactly(str, data)
+    kind = NUMBERS[base]
     if kind.kind == "b":
         return _exactly(bool, data)
     if kind.kind == "f":
@@ -208,14 +160,18 @@ def _checked(kind: numpy.dtype[Any], data: Any) -> Any:
         fits = -largest <= _exactly(float, data) <= largest
     else:
         limits = numpy.iinfo(kind)
+        if base == "byte" and 127 < _exactly(int, data) < 256:
+            data -= 256  # it is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed
         fits = limits.min <= _exactly(int, data) <= limits.max
     if not fits:
         raise ValueError
     return data
 
 
-def _is_digest(data: Any) -> bool:
-    return isinstance(data, dict) and data.keys() == {"sm3", "length"}
+def _numbers(base: str, data: Any) -> Any:
+    if base in BYTES:
+        return numpy.frombuffer(b64decode(data, validate=True), NUMBERS[base])
+    return numpy.array([_scalar(base, item) for item in _exactly(list, data)], NUMBERS[base])
 
 
 def _unfit(path: str, data: Any) -> VerificationError:

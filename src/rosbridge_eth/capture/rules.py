@@ -19,6 +19,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 from typing import Final, TypeAlias
 
 DEFAULT_LIMIT: Final = 16 * 1024
@@ -63,7 +64,7 @@ class Schedule:
 
     def __init__(self, rule: TopicRule) -> None:
         self._start = rule.from_ns if rule.at_ns is None else rule.at_ns
-        self._end = rule.until_ns
+        self._end = inf if rule.until_ns is None else rule.until_ns
         self._length = rule.for_ns
         self._single = rule.once or rule.at_ns is not None
         self._done = False
@@ -71,16 +72,15 @@ class Schedule:
         self._next: int | None = None
         self._latest: int | None = None
         self._interval = 0.0
-        self._set_end()
 
     def due(self, received_ns: int) -> bool:
         """Whether a message received then should be captured; `captured` tells that it was."""
         if self._done or (self._start is not None and received_ns < self._start):
             return False
-        if self._start is None and self._length is not None:
-            self._start = received_ns
-            self._set_end()
-        if self._end is not None and received_ns >= self._end:
+        if self._length is not None:  # the period is known now
+            self._start = received_ns if self._start is None else self._start
+            self._end, self._length = min(self._end, self._start + self._length), None
+        if received_ns >= self._end:
             return False
         if not self._period:
             return True
@@ -100,11 +100,6 @@ class Schedule:
             self._next, self._interval = None, 0.0
         elif gap > 0:
             self._interval += (gap - self._interval) / (8 if self._interval else 1)
-
-    def _set_end(self) -> None:
-        if self._start is not None and self._length is not None:
-            end = self._start + self._length
-            self._end = end if self._end is None else min(end, self._end)
 
 
 MAX_NAME = 255  # characters; https://design.ros2.org/articles/topic_and_service_names.html

@@ -204,7 +204,7 @@ def run_demo(
             progress()
             with stage("last batches"):
                 deadline = time.monotonic() + SETTLE
-                while any(waiting.chunks for waiting in inbox.totals().values()):
+                while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
                     check()
                     if time.monotonic() > deadline:
                         raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")

@@ -27,8 +27,8 @@ from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
 
 if TYPE_CHECKING:
-    from rosbridge_eth.inbox import Inbox
     from rosbridge_eth.ledger import Keyring, Ledger
+    from rosbridge_eth.log.store import Store
 
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
@@ -75,7 +75,7 @@ def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring
     return place, passphrase, Keyring.load(place.accounts, passphrase)
 
 
-def _inbox(place: OperatorHome) -> Inbox:
+def _inbox(place: OperatorHome) -> Store:
     from rosbridge_eth.server.supervisor import open_store
 
     return open_store(load_server_config(place.config), place)

@@ -14,7 +14,7 @@ An operator's home (made by `init`); it holds no reader's key and no robot's:
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
     reader.toml          the same for readers, to be put beside their keys
-    inbox.sqlite         the server's replica of the robots' logs
+    store.sqlite         the server's replica of the robots' logs
     bundles/             what `register` writes for robots
 
 A robot's home (made by `join`):
@@ -53,8 +53,7 @@ from rosbridge_eth.files import write_atomically
 from rosbridge_eth.log.chunk import ledger_id
 
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
-_FORMAT = "rosbridge-eth home 2"
-_OF_THE_FIRST_EDITION = ("server.toml", "bridge.json", "reader.toml", "journal.sqlite")
+_FORMAT = "rosbridge-eth home 3"
 _UNFINISHED = ".unfinished"
 
 
@@ -115,8 +114,8 @@ def _save(path: Path, value: dict[str, Any]) -> None:
     write_atomically(path, json.dumps(value, indent=1).encode() + b"\n")
 
 
-def _load(form: Callable[..., _Document], path: Path, mend: str, absent: BridgeError) -> _Document:
-    """What is made of the object in a file. ConfigError with the way out where it is none; `absent` without a file."""
+def _load(form: Callable[..., _Document], path: Path, fix: str, absent: BridgeError) -> _Document:
+    """What is made of the object in a file. ConfigError with the fix where it is none; `absent` without a file."""
     try:
         return form(**json.loads(path.read_bytes()))
     except FileNotFoundError:
@@ -124,7 +123,7 @@ def _load(form: Callable[..., _Document], path: Path, mend: str, absent: BridgeE
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}); {mend}") from error
+        raise ConfigError(f"{path} is damaged ({error}); {fix}") from error
 
 
 def make_home(path: Path, kind: HomeKind, **more: str) -> None:
@@ -132,20 +131,13 @@ def make_home(path: Path, kind: HomeKind, **more: str) -> None:
     _save(path / "home.json", {"format": _FORMAT, "kind": str(kind), **more})
 
 
-def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[str, Any]:
-    """What `make_home` wrote. ConfigError where it is no home, of the first edition, or not of this kind."""
-    if not any((path / name).exists() for name in ("home.json", _UNFINISHED)) and any(
-        (path / name).exists() for name in _OF_THE_FIRST_EDITION
-    ):
-        raise ConfigError(
-            f"{path} is a home of the first edition, whose records have another format, or lost its home.json;"
-            " make a new home in another folder"
-        )
-    nobodys = ConfigError(
+def home_of(path: Path, kind: HomeKind | None = None, fix: str = "") -> dict[str, Any]:
+    """What `make_home` wrote. ConfigError where it is no home, of another edition, or not of this kind."""
+    absent = ConfigError(
         f"{path} is not a home; `init --home` makes an operator's, `join` a robot's, `reader NAME` a reader's"
-        if kind is None else f"{path} is not {_WHOSE[kind]} home; {mend}"
+        if kind is None else f"{path} is not {_WHOSE[kind]} home; {fix}"
     )
-    head = _load(dict[str, Any], path / "home.json", "restore it from your backup", nobodys)
+    head = _load(dict[str, Any], path / "home.json", "restore it from your backup", absent)
     if head.get("format") != _FORMAT or head.get("kind") not in HomeKind.__members__.values():
         raise ConfigError(f"{path} was made by another version of this program; use that one, or make a new home")
     if kind is not None and head["kind"] != kind:
@@ -154,12 +146,12 @@ def home_of(path: Path, kind: HomeKind | None = None, mend: str = "") -> dict[st
 
 
 def kind_of(path: Path) -> HomeKind:
-    """Whose home this is; ConfigError if it is nobody's."""
+    """Whose home this is; ConfigError if it is none."""
     return HomeKind(home_of(path)["kind"])
 
 
 def require_empty(path: Path) -> None:
-    """ConfigError unless nothing is there yet: a home does not move in with anything else."""
+    """ConfigError unless nothing is there yet: a home is made in an empty folder."""
     if (path / "home.json").exists():
         raise ConfigError(f"{path} is {_WHOSE[kind_of(path)]} home already; choose another folder")
     if path.exists() and not (path / _UNFINISHED).exists() and (not path.is_dir() or any(path.iterdir())):
@@ -209,7 +201,6 @@ class OperatorHome:
         self.registry = path / "registry.sqlite"
         self.deployment_file = path / "deployment.json"
         self.reader_config = path / "reader.toml"
-        self.inbox = path / "inbox.sqlite"
         self.bundles = path / "bundles"
 
     @property
@@ -220,9 +211,9 @@ class OperatorHome:
     @property
     def account(self) -> str:
         """The operator's account on the chain, which accounts.json shows in the clear."""
-        mend = "restore it from your backup"
-        absent = ConfigError(f"{self.accounts} is missing; {mend}")
-        return str(_load(dict[str, Any], self.accounts, mend, absent).get("operator"))
+        fix = "restore it from your backup"
+        absent = ConfigError(f"{self.accounts} is missing; {fix}")
+        return str(_load(dict[str, Any], self.accounts, fix, absent)["operator"])
 
     def require(self) -> OperatorHome:
         """This home, if `init` made it; else ConfigError."""

@@ -447,7 +447,7 @@ class ChainConfig(Section):
 
 
 class StoreConfig(Section):
-    """The inbox: the server's replica of the robots' logs, until they are on the chain.
+    """The store: the server's replica of the robots' logs, until they are on the chain.
 
     url: `"sqlite"`, in the server's folder, or the URL of a Redis.
 
@@ -498,7 +498,7 @@ class ServerConfig(Section):
 
     chain: The node (below).
 
-    store: The inbox (below).
+    store: The server's replica of the logs (below).
 
     funds: Robots' accounts (below).
     """

@@ -10,10 +10,8 @@ the operator's address is shown in the clear. What is sealed is "mnemonic", a NU
 
 from __future__ import annotations
 
-from functools import cached_property
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.files import STRONG_SCRYPT_N, open_box, read_file, seal_box, write_atomically
@@ -27,12 +25,13 @@ WORDS = 24
 _KIND = b"mnemonic\0"
 
 
-def _derivation() -> ModuleType:
-    """eth_account's key derivation (BIP-32, 39, 44), imported where it is first needed."""
-    from eth_account import hdaccount
+def _eth_account() -> Any:
+    """eth_account.Account, imported where it is first needed."""
+    from eth_account import Account
 
+    Account.enable_unaudited_hdwallet_features()
     limit_recursion()
-    return hdaccount
+    return Account
 
 
 class Keyring:
@@ -48,36 +47,27 @@ class Keyring:
     @staticmethod
     def create() -> Keyring:
         """A new mnemonic of 24 words from the system's generator."""
-        from eth_account.types import Language
-
-        return Keyring(_derivation().generate_mnemonic(WORDS, Language.ENGLISH))
+        return Keyring(_eth_account().create_with_mnemonic(num_words=WORDS)[1])
 
     @staticmethod
     def from_mnemonic(words: str) -> Keyring:
         """BIP-39, any of its lengths; IdentityError if a word or the checksum is wrong."""
         from eth_utils.exceptions import ValidationError
 
-        normal, derivation = " ".join(words.split()), _derivation()
+        keyring = Keyring(" ".join(words.split()))
         try:
-            derivation.key_from_seed(derivation.seed_from_mnemonic(normal, ""), derivation.ETHEREUM_DEFAULT_PATH)
+            keyring.account(0)
         except (ValidationError, ValueError):
             raise IdentityError("this is no BIP-39 mnemonic: a word is unknown or the checksum wrong") from None
-        return Keyring(normal)
-
-    @cached_property
-    def _seed(self) -> bytes:
-        seed: bytes = _derivation().seed_from_mnemonic(self.mnemonic, "")
-        return seed
+        return keyring
 
     def account(self, number: int) -> LocalAccount:
         """m/44'/60'/0'/0/number."""
-        from eth_account import Account
-
         if not 0 <= number < 2**31:
             raise IdentityError(f"an account's number is in [0, 2**31), not {number}")
         if number not in self._accounts:
-            key = _derivation().key_from_seed(self._seed, f"m/44'/60'/0'/0/{number}")
-            self._accounts[number] = Account.from_key(key)
+            path = f"m/44'/60'/0'/0/{number}"
+            self._accounts[number] = _eth_account().from_mnemonic(self.mnemonic, account_path=path)
         return self._accounts[number]
 
     @property

@@ -139,8 +139,11 @@ class Database:
     def write(self, action: Callable[[], T], *, durable: bool = True) -> T:
         """Carry out `action` in one transaction, or not at all; it may be called twice. DiskFull, StoreError.
 
-        durable=False: without an fsync, for what is asked again if a power cut takes it.
+        durable=False: without an fsync, for what is asked again if a power cut takes it. A write within a write is a
+        part of that one.
         """
+        if self._db.in_transaction:
+            return action()
         with self.errors():
             self._db.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
             try:

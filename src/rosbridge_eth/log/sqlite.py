@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -10,7 +10,7 @@ from typing import Any, Final
 from eth_hash.auto import keccak
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.log.chunk import Header
+from rosbridge_eth.log.chunk import Chunk, Header
 from rosbridge_eth.log.database import Database, NothingThere
 from rosbridge_eth.log.store import (
     DEAD_LETTERS,
@@ -126,13 +126,17 @@ class SqliteStore(Store):
                     outcome = Outcome.FULL
                     full.add(tk)
                 else:
-                    row = (tk, place_of(header), header.digest, hash, size, header.records, now, chunk.encoded)
-                    self._db.run("INSERT INTO chunk VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+                    self._insert(tk, chunk, hash, now)
                     held, total = held + size, total + size
             if outcome in (Outcome.STORED, Outcome.KNOWN) and place_of(header) > state.head:
                 self._save(tk, state._replace(head=place_of(header), digest=header.digest), held)
             outcomes.append(outcome)
         return outcomes
+
+    def _insert(self, tk: bytes, chunk: Chunk, hash: bytes, now: float) -> None:
+        header, encoded = chunk.header, chunk.encoded
+        row = (tk, place_of(header), header.digest, hash, len(encoded), header.records, now, encoded)
+        self._db.run("INSERT INTO chunk VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
     def _judge(self, tk: bytes, state: State, header: Header, after: bytes) -> Outcome:
         """What the rule says of a chunk (see `Store.append`) where there is room for it."""
@@ -146,8 +150,8 @@ class SqliteStore(Store):
             first = self.rows(tk, NOWHERE, 1)
             return Outcome.DIFFERENT if not there and first and first[0].place < place else Outcome.KNOWN
         if header.previous != state.digest:
-            named = self._read("SELECT place FROM chunk WHERE tk = ? AND digest = ?", tk, header.previous)
-            if place == successor(state.head) or (named and self._between(tk, state.head, named[0][0], place)):
+            named = self.place(tk, header.previous)
+            if place == successor(state.head) or (named and self._between(tk, state.head, named, place)):
                 return Outcome.DIFFERENT
             if after != state.digest:
                 return Outcome.NOT_NEXT
@@ -178,6 +182,24 @@ class SqliteStore(Store):
                 self._db.run("UPDATE robot SET bytes = bytes - ? WHERE tk = ?", (size, tk))
         self._db.run("DELETE FROM dead WHERE no <= (SELECT max(no) FROM dead) - ?", (DEAD_LETTERS,))
 
+    def together(self, action: Callable[[], None]) -> None:
+        """Carry out what `action` changes in one commit, or not at all; it may be called twice."""
+        self._db.write(action)
+
+    def replace(self, tk: bytes, chunk: Chunk, now: float) -> None:
+        """Put another form of a chunk into its row. A power cut may take it back."""
+
+        def put() -> None:
+            self._remove(tk, [place_of(chunk.header)], "")  # an UPDATE would leave a page to what became short
+            self._insert(tk, chunk, keccak(chunk.encoded), now)
+            self._db.run("UPDATE robot SET bytes = bytes + ? WHERE tk = ?", (len(chunk.encoded), tk))
+
+        self._db.write(put, durable=False)
+
+    def forget_dead(self) -> None:
+        """Remove all dead letters."""
+        self._db.write(lambda: self._db.run("DELETE FROM dead"), durable=False)
+
     # What looks
 
     def states(self, tks: Sequence[bytes]) -> list[State]:
@@ -189,7 +211,12 @@ class SqliteStore(Store):
         return found[0][0] if found else None
 
     def has(self, tk: bytes, digest: bytes) -> bool:
-        return bool(self._read("SELECT 1 FROM chunk WHERE tk = ? AND digest = ?", tk, digest))
+        return self.place(tk, digest) is not None
+
+    def place(self, tk: bytes, digest: bytes) -> bytes | None:
+        """The place of the row with this header."""
+        found = self._read("SELECT place FROM chunk WHERE tk = ? AND digest = ?", tk, digest)
+        return found[0][0] if found else None
 
     def rows(self, tk: bytes, after: bytes, limit: int) -> list[Row]:
         found = self._read(
@@ -209,9 +236,13 @@ class SqliteStore(Store):
         return dict(self._read("SELECT tk, bytes FROM robot"))
 
     def waiting(self, tk: bytes) -> Waiting:
+        return self.behind(tk, self._robot(tk)[0].confirmed)
+
+    def behind(self, tk: bytes, place: bytes) -> Waiting:
+        """The rows behind a place, summed."""
         [figures] = self._read(
             "SELECT count(*), coalesce(sum(records), 0), coalesce(sum(size), 0), min(taken_at)"
-            " FROM chunk INDEXED BY row WHERE tk = ? AND place > ?", tk, self._robot(tk)[0].confirmed,
+            " FROM chunk INDEXED BY row WHERE tk = ? AND place > ?", tk, place,
         )  # fmt: skip
         return Waiting(*figures)
 

@@ -39,8 +39,8 @@ from rosbridge_eth.operator.status import ANSWER_TIME, span
 from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.robot.sender import mend
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.robot.topics import offered
-from rosbridge_eth.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
@@ -283,7 +283,7 @@ def store(home: OperatorHome, secret: bytes | None) -> Findings:
         return
     with closing(inbox):
         inbox.check()
-        yield ok("store", f"{sum(waiting.chunks for waiting in inbox.totals().values())} chunks wait")
+        yield ok("store", f"{sum(inbox.waiting(tk).chunks for tk in inbox.sizes())} chunks wait")
 
 
 def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:

@@ -1,6 +1,6 @@
 """`status`: what is where, by a home: who is enrolled, connected, waiting or on hold, and what the chain has.
 
-It asks registry, inbox, node and the figures of the running server or robot; whatever of them is not there, the rest is
+It asks registry, store, node and the figures of the running server or robot; whatever of them is not there, the rest is
 shown, and a sentence says what is not known and why. Nothing is changed or made.
 """
 
@@ -24,8 +24,9 @@ from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityE
 from rosbridge_eth.identity import Role
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
+from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.operator.registry import Enrolment, Registry, differences
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
 
 if TYPE_CHECKING:
@@ -36,10 +37,11 @@ ANSWER_TIME = 5.0  # seconds for a node or a monitor
 SPENDING_BLOCKS = 100  # what an account spends is seen by its balance so many blocks ago: geth keeps 128 states
 SEEN = 15.0  # seconds since a worker last saw the session
 FOLLOW_EVERY = 2.0
-DEAD = 1000  # dead letters; the inbox keeps no more
+DEAD = 1000  # dead letters; the store keeps no more
 Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
 FEW_DAYS = 7.0
+FORKED_FOR = 600.0  # seconds for which it is told that a log went on in two places
 Figure = tuple[str, dict[str, str], float]
 _NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
 _SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
@@ -87,7 +89,9 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
     for name, labels, value in sorted(figures, key=lambda figure: figure[2]):
         if (robot := report["robots"].get(labels.get("robot"))) is None:
             continue
-        if name == "session_seen_seconds" and now - value < SEEN:
+        if name == "forked_seconds":
+            robot["forked"] = now - value < FORKED_FOR
+        elif name == "session_seen_seconds" and now - value < SEEN:
             robot |= {"connected": True, "address": labels["address"]}
         elif name in _OF_ROBOT:
             of = robot.setdefault("waiting", {}) if name.startswith("waiting_") else robot
@@ -158,10 +162,11 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
 
     names = {tk: robot.name for tk, robot in robots.items()}
     with closing(open_store(config, place, read_only=True)) as inbox:
-        for tk, waiting in inbox.totals().items():
+        for tk in inbox.sizes():
+            waiting, [state] = inbox.waiting(tk), inbox.states([tk])
             robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
             oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
-            hold = inbox.state(tk).hold if waiting.chunks or robot["in_force"] else None
+            hold = state.hold if waiting.chunks or robot["in_force"] else ""
             robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
         reasons = Counter((letter.tk, letter.why) for letter in inbox.dead(DEAD))
     report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
@@ -231,6 +236,8 @@ def _alarms(report: Report) -> Iterator[str]:
     for name, robot in report["robots"].items():
         if hold := robot.get("hold"):
             yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
+        if robot.get("forked"):
+            yield f"ALARM: {name}: {FORKED}"
         if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
             yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
     for each in report["dead"]:
@@ -245,7 +252,8 @@ def _robot(place: RobotHome) -> Report:
     report: Report = {
         "robot": end.robot, "server": f"{end.server_name} at {config.server or end.server_address}",
         "topics": [topic.topic for topic in config.topics], "nodes": list(config.nodes),
-        "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "unknown": [],
+        "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "alarms": [],
+        "unknown": [],
     }  # fmt: skip
     with _asking(report, "the spool"):
         log = Log(end.ledger, robot_id(end.robot))
@@ -254,11 +262,14 @@ def _robot(place: RobotHome) -> Report:
                 report["spool"] = spool.statistics()._asdict()
         except InUse:
             report["runs"] = True
+            running = _running(report, place.path, _SILENT, ["robot"])
+            seen = [value for name, _, value in running if name == "forked_seconds"]
+            report["alarms"] = [f"ALARM: {FORKED}" for value in seen if time.time() - value < FORKED_FOR]
             wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
                       "trigger_records")  # fmt: skip
             report["figures"] = {
                 " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in _running(report, place.path, _SILENT, ["robot"]) if name in wanted
+                for name, labels, value in running if name in wanted
             }  # fmt: skip
     return report
 
@@ -342,6 +353,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("spool", kept), *_process(report),
         *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
     ])  # fmt: skip
+    yield from report["alarms"]
 
 
 def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:

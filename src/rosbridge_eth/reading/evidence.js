@@ -295,12 +295,13 @@ const evidence = (() => {
     return found
   }
 
-  // The robot's signing certificate of a registration, if the CA signed both for this robot; judged by when they begin.
-  // What has to hold is the table of docs/log.md (Certificates).
-  function signer(certificates, roots, robot) {
+  // The robot's signing certificate of a registration, if the CA signed both for this robot; judged at the time given (ms),
+  // or when the later one begins if that is later. What has to hold is the table of docs/log.md (Certificates).
+  function signer(certificates, roots, robot, time = 0) {
     const first = element(certificates).whole
     const pair = [certificate(first), certificate(certificates.subarray(first.length))]
-    const at = Math.max(...pair.map(({ from }) => from))
+    const from = Math.max(...pair.map((made) => made.from))
+    const at = Math.max(time, from)
     pair.forEach((made, n) => {
       const name = `6,urn:rosbridge-eth:robot:${robot}`
       need(made.names.length === 1 && String(made.names[0]) === name, `a certificate is not for ${robot}`)
@@ -308,33 +309,40 @@ const evidence = (() => {
         root.subject === made.issuer && root.authority && !root.constrained && (root.usage === null || root.usage & 0x04) &&
         root.from <= at && at <= root.until && signed(root.key, made.tbs, made.r, made.s)
       need(roots.some(issued), 'the CA did not sign a certificate')
-      need(made.from <= at && at <= made.until, 'a certificate ends before the other begins')
+      need(at <= made.until, 'a certificate had ended')
       const [own, others] = n ? [0x08, 0xc0] : [0xc0, 0x38]
       need((made.usage & own) === own && !(made.usage & others) && !made.purposes, 'a certificate is for another use')
       need(!made.authority, "a certificate is a CA's")
     })
-    return { key: pair[0].key, fingerprint: hex(sm3(first)), until: Math.min(pair[0].until, pair[1].until) }
+    return { key: pair[0].key, fingerprint: hex(sm3(first)), from, until: Math.min(pair[0].until, pair[1].until) }
   }
 
   // ---------------------------------------------------------------- the chunk, docs/log.md
 
   function chunkOf(data) {
+    const form = (holds) => need(holds, 'a chunk is not in the form of one')
     const count = data[138]
     const end = 139 + count * 113
-    const form = (holds) => need(holds, 'a chunk is not in the form of one')
-    form(data.length >= end + 64 && data[0] === 3 && data[1] <= 1 && count >= 1 && count <= 16)
-    const header = data.subarray(0, end)
-    const field = (at, size) => header.subarray(at, at + size)
-    const rest = data.length - end - 64
-    const length = small(field(102, 4))
-    form(length % 64 === 16 && length > 16 && length < 2 ** 16 && (rest === 0 || rest === length))
-    form(small(field(66, 4)) >= 1 && small(field(66, 4)) <= 1000 && big(field(58, 8)) < 253402300800000n)
+    form(data.length >= end + 64 && data[0] === 3 && data[1] <= 1)
+    const field = (at, size) => data.subarray(at, at + size)
+    const body = data.subarray(end + 64)
+    const [records, length, digest] = [small(field(66, 4)), small(field(102, 4)), hex(field(106, 32))]
+    const nothing = hex(sm3([]))
+    form(body.length === 0 || body.length === length)
+    form(records
+      ? records <= 1000 && count >= 1 && count <= 16 && length % 64 === 16 && length > 16 && length < 2 ** 16
+      : !count && !length && digest === nothing && hex(field(70, 32)) === nothing)
+    form(big(field(58, 8)) < 253402300800000n)
     return {
-      encoded: header, digest: hex(sm3(header)), stream: hex(field(2, 16)), number: String(big(field(18, 8))),
-      sealed: small(field(58, 8), 'when a chunk was sealed'), records: small(field(66, 4)), root: field(70, 32),
-      r: big(data.subarray(end, end + 32)), s: big(data.subarray(end + 32, end + 64)), bare: rest === 0,
+      encoded: field(0, end), digest: hex(sm3(field(0, end))), goodbye: data[1] === 1, stream: hex(field(2, 16)),
+      place: field(2, 24), number: big(field(18, 8)), previous: hex(field(26, 32)), sealed: small(field(58, 8)), records,
+      root: field(70, 32), bodyDigest: digest, grants: [...Array(count).keys()].map((n) => field(139 + n * 113, 113)),
+      r: big(field(end, 32)), s: big(field(end + 32, 32)), body, bare: length > 0 && !body.length,
     }
   }
+  const isSigned = (chunk, log, key) => signed(
+    key, join(utf8.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, chunk.encoded), chunk.r, chunk.s)
+  const logOf = (chain, genesis, contract, robot) => join(sm3(word(chain), genesis, contract), keccak(utf8.encode(robot)))
 
   // RFC 9162, 2.1.3.2, with its names.
   function proven(root, records, index, salt, line, path) {
@@ -352,19 +360,24 @@ const evidence = (() => {
     return sn === 0 && same(r, root)
   }
 
-  // A record's line, its long integers as text: JavaScript's numbers would lose digits of the times. As the robot writes
+  // What a line says, its long integers as text: JavaScript's numbers would lose digits of the times. As the robot writes
   // it: no white space, no needless escapes, no name twice; JSON.parse takes the last of two, and 1e400 for a number.
-  const STRING = String.raw`"[^"\\]*(?:\\.[^"\\]*)*"`
-  const TOKEN = new RegExp(`${STRING}|[-+.\\w]+|[^]`, 'g')
-  const MESSAGE = new RegExp(`^\\{"topic":${STRING},"type":${STRING},"source":${STRING},` +
-    '"received_ns":(-?\\d+),"captured_ns":(-?\\d+),"clock":(?:true|false),"data":\\{')
-  function parsed(line) {
+  const TEXT = String.raw`"[^"\\]*(?:\\.[^"\\]*)*"`
+  const TOKEN = new RegExp(`${TEXT}|[-+.\\w]+|[^]`, 'g')
+  const KINDS = Object.entries({
+    message: '{"topic":T,"type":T,"source":T,"received_ns":N,"captured_ns":N,"clock":(?:true|false),"data":{.*}}',
+    type: '{"type":T,"wire":T,"format":T,"definition":T}', lost: '{"lost":N,"topic":T,"why":T}',
+    trigger: '{"trigger":T,"why":T,"at_ns":N}', stream: '{"stream":{"source":T,"software":T}}',
+  }).map(([kind, form]) => {
+    const names = form.replace(/"stream":\{.*\}\}/, '"stream":').match(/"\w+"(?=:)/g).join().replaceAll('"', '')
+    const text = form.replace(/[{}]/g, '\\$&').replaceAll('T', TEXT).replaceAll('N', '(-?\\d+)')
+    return [kind, names, new RegExp(`^${text}$`, 's')]
+  })
+  function lineOf(line) {
     const form = (holds) => need(holds, 'it is not in the one form of a record')
     form(utf8.encode(line).length <= 60 * 1024)
-    const [message, ...times] = MESSAGE.exec(line) ?? []
-    need(message && times.every((time) => BigInt(time) >= 0n && BigInt(time) < 2n ** 63n), 'it is no captured message')
-    const [tokens, open] = [line.match(TOKEN), []] // open: of each level, an object's names, or null for an array
-    const exact = tokens.map((token, n) => {
+    const open = [] // of each level, an object's names, or null for an array
+    const exact = line.match(TOKEN).map((token, n, tokens) => {
       if (token === '{' || token === '[') form(open.push(token === '{' ? new Set() : null) <= 100)
       else if (token === '}' || token === ']') open.pop()
       else if (token[0] === '"') {
@@ -374,9 +387,15 @@ const evidence = (() => {
       } else form(token.trim() && (!/[-\d]/.test(token[0]) || Number.isFinite(Number(token))))
       return token.length > 15 && /^-?[1-9]\d*$/.test(token) ? `"${token}"` : token
     })
-    const value = JSON.parse(exact.join(''))
-    need(Object.keys(value).join() === 'topic,type,source,received_ns,captured_ns,clock,data', 'it is no captured message')
-    return value
+    const content = JSON.parse(exact.join(''))
+    const names = Object.keys(content).join()
+    for (const [kind, members, text] of KINDS) {
+      const [whole, ...counts] = (names === members && text.exec(line)) || []
+      if (whole === undefined) continue
+      form(counts.every((count) => BigInt(count) >= 0n && BigInt(count) < 2n ** 63n))
+      return { kind, content }
+    }
+    return form(false)
   }
 
   // ---------------------------------------------------------------- the file
@@ -429,8 +448,7 @@ const evidence = (() => {
     const file = read(text)
     const { robot } = file
     const [genesis, contract] = [unhex(file.genesis, 32, 'the first block'), unhex(file.contract, 20, 'the contract')]
-    const tk = keccak(utf8.encode(robot))
-    const log = join(sm3(word(file.chain_id), genesis, contract), tk)
+    const log = logOf(file.chain_id, genesis, contract, robot)
     const authorities = file.authorities.map((one) => unhex(one, undefined, "a CA's certificate"))
     told('the file is whole and in its one form')
 
@@ -453,8 +471,7 @@ const evidence = (() => {
       need(hashes[written.chunk - written.first] === hex(keccak(encoded)),
         `chunk ${written.chunk} is not the one that its batch has there`)
       const [chunk, by] = [chunkOf(encoded), signers[written.certificate]]
-      const form = join(utf8.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, chunk.encoded)
-      need(by && signed(by.key, form, chunk.r, chunk.s), `the robot did not sign chunk ${written.chunk}`)
+      need(by && isSigned(chunk, log, by.key), `the robot did not sign chunk ${written.chunk}`)
       need(chunk.sealed <= by.until, `chunk ${written.chunk} was sealed after the end of the robot's certificate`)
       return [written.chunk, { ...chunk, written }]
     }))
@@ -470,7 +487,9 @@ const evidence = (() => {
         const beside = list(path, 'the hashes of a path').map((one) => unhex(one, 32, 'a hash'))
         const holds = proven(of.root, of.records, record, unhex(salt, 16, 'a salt'), utf8.encode(line), beside)
         need(holds, "it is not what the chunk's root commits to")
-        return { chunk, record, line, content: parsed(line), sealed: of.sealed, written: of.written }
+        const { kind, content } = lineOf(line)
+        need(kind === 'message', 'it is no captured message')
+        return { chunk, record, line, content, sealed: of.sealed, written: of.written }
       } catch (error) {
         throw new Wrong(`record ${record} of chunk ${chunk}: ${error.message}`)
       }
@@ -483,6 +502,9 @@ const evidence = (() => {
     }
   }
 
-  return { verify, sm3, keccak, signed, grouped, Wrong, hex, unhex }
+  return {
+    verify, sm3, keccak, signed, grouped, Wrong, hex, unhex, join, word, big, certificate, element, signer, chunkOf, isSigned,
+    logOf, lineOf,
+  }
 })()
 if (typeof module === 'object') module.exports = evidence

@@ -103,7 +103,7 @@ class Finding:
 
 
 class Findings:
-    """Collects findings in bounded memory: neighbours with one kind and detail are one, and so are equal notices."""
+    """Collects findings in bounded memory: those of one kind and detail are one."""
 
     def __init__(self, counts: Mapping[str, int], kept: Iterable[Finding]) -> None:
         self.counts: Counter[str] = Counter(counts)
@@ -114,7 +114,7 @@ class Findings:
         last = first if last is None else last
         self.counts[kind.label] += count
         known = self._latest.get((kind, detail))
-        if known is not None and (not kind.violation or first <= known.places[-1][1] + 1):
+        if known is not None:
             known.add(first, last, count)
         elif len(self.kept) < (MAX_FINDINGS if kind.violation else MAX_FINDINGS // 2):
             found = self._latest[kind, detail] = Finding(kind, [(first, last)], count, detail)

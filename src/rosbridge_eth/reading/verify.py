@@ -40,6 +40,11 @@ CLOCK_BACK_MS: Final = 1_000
 MAX_TYPES: Final = 256
 MAX_ELSEWHERE: Final = 16
 NO_DIGEST: Final = bytes(32)
+REMEDY: Final = (
+    "another machine has this robot's identity, or its disk was put back from an old copy: `revoke` the robot,"
+    " `register --replace`, and `join` the new bundle in a new folder on one machine"
+)
+"""Told once for a log that branches, whatever the number of chunks."""
 LAST_MOMENT: Final = 253_402_300_799
 """The end of 9999 in seconds since 1970; what a node says is later is taken for that."""
 
@@ -315,31 +320,23 @@ class Verifier:
         same_stream = head is not None and header.stream.hex() == head.stream
         ahead = header.number - (head.number + 1 if head is not None and same_stream else 0)
         knows_none = not same_stream and header.number == 0 and header.previous == NO_DIGEST
-        breaks = ahead != 0 or not (follows or knows_none)
+        goes_back = head is not None and (head.goodbye if same_stream else header.stream.hex() < head.stream)
+        breaks = ahead != 0 or goes_back or not (follows or knows_none)
         self._broken = self._broken or breaks
         # In an unbroken log what names the one before it cannot be there twice; after a break it can.
-        known = self.links.index_of(header.digest) if self._broken or knows_none else None
-        if known is not None:
-            raise Refused(Kind.FORKED, f"the chunk of index {known} once more")
-        if breaks:
-            self._tell_break(index, header, ahead, same_stream)
+        if (self._broken or knows_none) and self.links.index_of(header.digest) is not None:
+            raise Refused(Kind.FORKED, "a chunk that was read before, once more")
+        if goes_back or (same_stream and ahead <= 0 and breaks) or (breaks and self._knows(header.previous)):
+            self.findings.add(Kind.FORKED, index, detail=REMEDY)
+        elif breaks:
+            self.findings.add(Kind.MISSING, index, count=max(1, ahead), detail="" if ahead else "one chunk or more")
         if head is not None and not same_stream and (knows_none or not head.goodbye):
             detail = "it knows of nothing before: what it held is lost" if knows_none else ""
             self.findings.add(Kind.RESTARTED, index, detail=detail)
         self.links.add(header.digest, index, chunk.bare)
 
-    def _tell_break(self, index: int, header: Header, ahead: int, same_stream: bool) -> None:
-        """Forked where the robot wrote something else at this place or after what it follows; else missing."""
-        where = f"number {header.number} of stream {header.stream.hex()[:8]}"
-        followed = None if header.previous == NO_DIGEST else self.links.index_of(header.previous)
-        if followed is not None:
-            self.findings.add(Kind.FORKED, index, detail=f"{where} follows the chunk of index {followed}")
-        elif same_stream and ahead <= 0:
-            self.findings.add(Kind.FORKED, index, detail=f"{where}, where another one is")
-        elif ahead > 0:
-            self.findings.add(Kind.MISSING, index, count=ahead, detail=f"before {where}")
-        else:
-            self.findings.add(Kind.MISSING, index, detail=f"what {where} follows; it may be more than one")
+    def _knows(self, digest: bytes) -> bool:
+        return digest != NO_DIGEST and self.links.index_of(digest) is not None
 
     def _check_clock(self, index: int, header: Header, signer: Governing, block: int) -> None:
         sealed = header.sealed_ms

@@ -1,13 +1,13 @@
 """The black box: records of chosen topics are kept in memory and go into the log when an event happens.
 
 A trigger is an event and what is done about it: the last `before` of its topics' records, and those of the next
-`after`, are written. An event is a message that a condition of the trigger holds for, or whoever calls `fire`. One that
-happens while records are written for the one before only makes that last longer.
+`after`, are written. An event is a message for which a condition of the trigger holds, or a call of `fire`. An event
+while records are still written for the one before makes that last longer.
 
 Time is the messages' receive time, so a bag gives the same records at any replay speed. A trigger keeps at most its
-`memory`: a record counts its line, the definition of its type (once for all of that definition), and 256 bytes for the
-objects that hold it. What has to go before its time is over is counted, by the second, and is `lost` for "memory" if
-an event follows that would have had it written.
+`memory`: a record counts its line, and 256 bytes for the objects that hold it. What is removed for want of memory
+before its time is over is counted, by the second, and is `lost` for "memory" if an event follows for which it would
+have been written.
 
 No clock and no I/O. What was kept is gone when the process ends.
 """
@@ -30,7 +30,7 @@ from rosbridge_eth.capture import Conversion, DecodeError, Decoder, NamePattern,
 from rosbridge_eth.capture.conversion import BYTES
 from rosbridge_eth.capture.definitions import DURATION, TIME
 from rosbridge_eth.capture.messages import MAX_RAW
-from rosbridge_eth.capture.process import LAST_TIME
+from rosbridge_eth.capture.process import LAST_TIME, MAX_CONVERSIONS
 from rosbridge_eth.capture.restoration import NOT_FINITE
 from rosbridge_eth.capture.rules import Step, parse_path, parse_paths
 from rosbridge_eth.errors import ConfigError
@@ -40,8 +40,6 @@ log = logging.getLogger(__name__)
 OVERHEAD: Final = 256
 """Bytes counted for each record besides its line: two tuples, an integer, a bytes object's head, a queue's place."""
 SECOND: Final = 10**9
-MAX_DECODERS: Final = 64
-"""Definitions that one condition is compiled for; a publisher may bring another with each of its connections."""
 
 _OPERATORS: Final[dict[str, Callable[[Any, Any], bool]]] = {
     "==": operator.eq, "!=": operator.ne, "<=": operator.le, ">=": operator.ge, "<": operator.lt, ">": operator.gt,
@@ -58,62 +56,51 @@ class Condition(NamedTuple):
     text: str
     topic: str
     field: str
-    path: tuple[Step, ...]
     sign: str
     value: bool | int | float | str
 
     @classmethod
     def parse(cls, text: str) -> Condition:
         """Raises ValueError with the rest of a sentence."""
-        match = _FORM.fullmatch(text)
-        try:
+        match, value = _FORM.fullmatch(text), None
+        with suppress(ValueError):
             value = orjson.loads(match[4]) if match else None
-        except ValueError:
-            value = None
-        if match is None or not isinstance(value, bool | int | float | str):
+        kinds = (int, float) if match and match[3] not in ("==", "!=") else (bool, int, float, str)
+        if match is None or type(value) not in kinds or not (topic := NamePattern(match[1])).is_exact:
             raise ValueError(
-                f"is {text!r}; write a topic, a field, a comparison (== != < <= > >=) and a number, true, false or a"
-                " \"string\", such as '/bumper data == true'"
+                f"is {text!r}; write the name of a topic, a field, == or != (for a number also < <= > >=), and a"
+                " number, true, false or a \"string\", such as '/bumper data == true'"
             )
-        if isinstance(value, bool | str) and match[3] not in ("==", "!="):
-            raise ValueError(f"is {text!r}; only numbers are less or more than others")
-        topic = NamePattern(match[1])
-        if not topic.is_exact:
-            raise ValueError(f"is {text!r}; name one topic")
-        return cls(text, topic.text, match[2], parse_path(match[2]), match[3], value)
+        parse_path(match[2])
+        return cls(text, topic.text, match[2], match[3], value)  # type: ignore[arg-type]
 
     def compiled(self, decoder: Decoder) -> Callable[[RawMessage], bool]:
-        """What tells whether it holds for a message of this type, or raises DecodeError. ConfigError where the type has
-        no such field, or one of another kind than the constant."""
+        """A function that says whether it holds for a message of this type, or raises DecodeError. ConfigError where
+        the type has no such field, or one of another kind than the constant."""
+        path, compare = parse_path(self.field), _OPERATORS[self.sign]
         conversion = Conversion(decoder, parse_paths([self.field]), limit=MAX_RAW)
         wanted = {bool: "true or false", str: "a string"}.get(type(self.value), "a number")
-        if (found := self._kind(decoder)) != wanted:
+        if (found := _kind(path, decoder)) != wanted:
             raise ConfigError(f"{self.field} of {decoder.type_name} is {found}, and compared with {wanted}")
-        compare = _OPERATORS[self.sign]
+        stands_for = NOT_FINITE if wanted == "a number" else {}
 
         def holds(raw: RawMessage) -> bool:
-            found = _at(self.path, conversion.convert(decoder.decode(raw.raw)))
-            if wanted == "a number":
-                found = (NOT_FINITE.get(each, each) for each in found)
-            return any(compare(each, self.value) for each in found)
+            found = _at(path, conversion.convert(decoder.decode(raw.raw)))
+            return any(compare(stands_for.get(each, each), self.value) for each in found)
 
         return holds
 
-    def _kind(self, decoder: Decoder) -> str:
-        """What the field is, in words; Conversion has found that there is one."""
-        description: Any = (Nodetype.NAME, decoder.type_name)
-        for step in self.path:
-            if description[0] == Nodetype.NAME:
-                description = dict(decoder.fields[description[1]])[str(step)]
-            else:
-                description = description[1][0]
-                if step == "*" and description[0] == Nodetype.BASE and description[1][0] in BYTES:
-                    return "bytes, of which one is named by its index"
-        if description[0] == Nodetype.NAME:
-            return "a number" if description[1] in (TIME, DURATION) else "a message"
-        if description[0] != Nodetype.BASE:
-            return "an array"
-        return {"bool": "true or false", "string": "a string"}.get(description[1][0], "a number")
+
+def _kind(path: Sequence[Step], decoder: Decoder) -> str:
+    """What the field at this path is, in words; there is one."""
+    description: Any = (Nodetype.NAME, decoder.type_name)
+    for step in path:
+        of_message = description[0] == Nodetype.NAME
+        description = dict(decoder.fields[description[1]])[str(step)] if of_message else description[1][0]
+    kind, what = description
+    if kind == Nodetype.BASE and not (path[-1] == "*" and what[0] in BYTES):  # bytes are no list in the record
+        return {"bool": "true or false", "string": "a string"}.get(what[0], "a number")
+    return "a number" if what in (TIME, DURATION) else "no single value"
 
 
 def _at(path: Sequence[Step], value: Any) -> Iterator[Any]:
@@ -143,53 +130,38 @@ class Ring:
     def __init__(self, length_ns: int, memory: int) -> None:
         self._length, self._memory = length_ns, memory
         self._records: deque[Record] = deque()
-        self._definitions: Counter[bytes] = Counter()
-        self._early: dict[int, Counter[str]] = {}  # second of receipt -> topics of what had to go before its time
+        self._early: dict[int, Counter[str]] = {}  # by second of receipt: topics of what was removed before its time
         self.bytes = 0
 
     def __len__(self) -> int:
         return len(self._records)
 
     def add(self, record: Record) -> None:
-        """Keep it, and no longer what it leaves no time or room for."""
+        """Keep it, and remove from the front what is too old, and what there is no memory for."""
         self._records.append(record)
-        self.bytes += self._size(record, +1)
-        while self._records and self._records[0].received_ns < record.received_ns - self._length:
-            self._pop()
-        while self.bytes > self._memory:
-            gone = self._pop()
+        self.bytes += OVERHEAD + len(record.line)
+        since_ns = record.received_ns - self._length
+        while self._records and (self._records[0].received_ns < since_ns or self.bytes > self._memory):
+            gone = self._records.popleft()
+            self.bytes -= OVERHEAD + len(gone.line)
             second = gone.received_ns // SECOND
-            if second not in self._early:  # those of the future are a clock's that was set back
-                oldest = (record.received_ns - self._length) // SECOND
-                self._early = {key: held for key, held in self._early.items() if oldest <= key <= second}
-                self._early[second] = Counter()
-            self._early[second][gone.topic] += 1
+            if gone.received_ns >= since_ns and second not in self._early:
+                # Later ones are from before the clock was set back.
+                kept = {key: topics for key, topics in self._early.items() if since_ns // SECOND <= key <= second}
+                self._early = kept | {second: Counter()}
+            if gone.received_ns >= since_ns:
+                self._early[second][gone.topic] += 1
 
     def take(self, at_ns: int) -> tuple[list[Record], Counter[str]]:
-        """All that is kept at this time, which is then empty; and what had to go early, by topic."""
+        """All that is kept at this time, which is then empty; and what was removed early, by topic."""
         since_ns = at_ns - self._length
         # All are looked at: a clock that was set back leaves records of the future in front of older ones.
         records = [record for record in self._records if record.received_ns >= since_ns]
         early = sum((held for second, held in self._early.items() if second >= since_ns // SECOND), Counter[str]())
         self._records.clear()
-        self._definitions.clear()
         self._early.clear()
         self.bytes = 0
         return records, early
-
-    def _pop(self) -> Record:
-        record = self._records.popleft()
-        self.bytes -= self._size(record, -1)
-        return record
-
-    def _size(self, record: Record, change: int) -> int:
-        """Bytes that it takes, or gives back: its definition's if it is the first, or was the last, to refer to it."""
-        definition = b"" if record.definition is None else record.definition[1]
-        others = self._definitions[definition] - (change < 0)
-        self._definitions[definition] += change
-        if not self._definitions[definition]:
-            del self._definitions[definition]
-        return OVERHEAD + len(record.line) + (0 if others else len(definition))
 
 
 class Trigger:
@@ -198,17 +170,15 @@ class Trigger:
     def __init__(self, rule: TriggerRule) -> None:
         self.rule, self.ring = rule, Ring(rule.before_ns, rule.memory)
         self.fired = 0
-        self._begin, self._end = 0, -1
-
-    def is_open(self, at_ns: int) -> bool:
-        return self._begin <= at_ns <= self._end
+        self.open = range(0)
+        """Receive times (ns) whose records are written. It has a beginning, since a clock may be set back."""
 
     def fire(self, at_ns: int) -> bool:
         """Whether an event at this time is one of its own, and not the same still going on."""
-        begun = not self.is_open(at_ns)
+        begun = at_ns not in self.open
         self.fired += begun
-        self._end = at_ns + self.rule.after_ns if begun else max(self._end, at_ns + self.rule.after_ns)
-        self._begin = at_ns - self.rule.before_ns
+        end = at_ns + self.rule.after_ns + 1
+        self.open = range(at_ns - self.rule.before_ns, end if begun else max(end, self.open.stop))
         return begun
 
 
@@ -228,13 +198,10 @@ class BlackBox:
 
     def take_up(self, rules: Iterable[TriggerRule]) -> None:
         """Go on by other rules. What is kept for one that stays the same stays."""
-        known = self.triggers
-        self.triggers = {
-            rule.name: known[rule.name] if rule.name in known and known[rule.name].rule == rule else Trigger(rule)
-            for rule in rules
-        }
+        known = {trigger.rule: trigger for trigger in self.triggers.values()}
+        self.triggers = {rule.name: known.get(rule) or Trigger(rule) for rule in rules}
         self._conditions: dict[str, list[tuple[Trigger, Condition]]] = {}
-        self._compiled = lru_cache(MAX_DECODERS)(self._compile)
+        self._compiled = lru_cache(MAX_CONVERSIONS * len(self.triggers))(self._compile)
         for trigger in self.triggers.values():
             for condition in trigger.rule.when:
                 self._conditions.setdefault(condition.topic, []).append((trigger, condition))
@@ -265,7 +232,7 @@ class BlackBox:
     def keep(self, name: str, record: Record) -> None:
         """Take a record of a topic of this trigger: for the log, while an event lasts; else into memory."""
         trigger = self.triggers[name]
-        if trigger.is_open(record.received_ns):
+        if record.received_ns in trigger.open:
             self.released.append(record)
         else:
             trigger.ring.add(record)
@@ -277,11 +244,10 @@ class BlackBox:
                 continue
             records, early = trigger.ring.take(at_ns)
             notice = trigger_line(trigger.rule.name, why, min(max(at_ns, 0), LAST_TIME))
-            self.released.append(Record("", at_ns, notice, None))
-            self.released += records
+            self.released += [Record("", at_ns, notice, None), *records]
             self.lost.update({(topic, "memory"): count for topic, count in early.items()})
             log.warning(
                 "trigger %s (%s): %d records from before are written, and what comes in the next %.3g s%s",
                 trigger.rule.name, why, len(records), trigger.rule.after_ns / SECOND,
-                f"; {early.total()} had to go before, for want of memory" if early else "",
+                f"; {early.total()} were removed before, for want of memory" if early else "",
             )

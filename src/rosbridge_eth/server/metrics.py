@@ -32,8 +32,8 @@ from prometheus_client.multiprocess import MultiProcessCollector
 from rosbridge_eth.channel import Drop
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
-from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.log.store import Store
 
 if TYPE_CHECKING:
     from rosbridge_eth.operator.registry import Enrolment
@@ -69,7 +69,12 @@ NEWEST = _gauge(
     "newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "process", "robot"
 )
 SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
-WAITING = _gauge("waiting_chunks", "Chunks in the inbox that are not confirmed on the chain.", "robot")
+FORKED = _gauge(
+    "forked_seconds",
+    "When its log was last seen to go on in two places, or two machines to have its identity, seconds since 1970.",
+    "robot",
+)
+WAITING = _gauge("waiting_chunks", "Chunks in the store that are not confirmed on the chain.", "robot")
 WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
 OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
 HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` says why.", "robot")
@@ -299,22 +304,23 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time
             SESSION.labels(session.peer.name, address[0]).set(wall)
+    for robot, at in reception.forked.items():
+        FORKED.labels(robot).set(wall - time.monotonic() + at)
     CONDITION.labels(f"{process} stores chunks").set(reception.trouble.why is None)
 
 
 def show_submitter(
-    submitter: Submitter, inbox: Inbox, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+    submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
 ) -> None:  # fmt: skip
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     process = "submitter"
     beat(process, wall)
-    states = inbox.states([*robots])
-    for tk, robot in robots.items():
-        name, held = robot.name, inbox.waiting(tk, states[tk].position)
+    for (tk, robot), state in zip(robots.items(), store.states([*robots]), strict=True):
+        name, held = robot.name, store.waiting(tk)
         WAITING.labels(name).set(held.chunks)
         WAITING_BYTES.labels(name).set(held.bytes)
         OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
-        HELD.labels(name).set(states[tk].hold is not None and (held.chunks > 0 or robot.revoked_at is None))
+        HELD.labels(name).set(bool(state.hold) and (held.chunks > 0 or robot.revoked_at is None))
         GAS.labels(name).set(submitter.gas[tk])
         if standing := submitter.standings.get(tk):
             ON_CHAIN.labels(name).set(standing.chunks)
@@ -353,7 +359,9 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
         SPOOL_CHUNKS.labels(name, state).set(chunks)
     SPOOL_BYTES.labels(name).set(spool.bytes)
     SPOOL_DROPPED.labels(name).set(spool.dropped_bodies)
-    CONNECTED.labels(name).set(robot.sender.statistics.connected)
-    CONDITION.labels("robot has a session").set(robot.sender.statistics.connected)
+    CONNECTED.labels(name).set(robot.sender.connected)
+    if robot.sender.forked:
+        FORKED.labels(name).set(wall)
+    CONDITION.labels("robot has a session").set(robot.sender.connected)
     CONDITION.labels("server's name has an address").set(robot.loop.resolved)
     CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)

@@ -32,9 +32,10 @@ from rosbridge_eth.config.home import Deployment, OperatorHome
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import BridgeError, ExitCode, ProcessError, StoreError
 from rosbridge_eth.identity import Identity
-from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
+from rosbridge_eth.log import opening
+from rosbridge_eth.log.store import Store
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.operator.enrolment import server_trust
 from rosbridge_eth.operator.registry import Registry
@@ -85,25 +86,25 @@ def notify(state: str) -> None:
         sock.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
-def open_store(config: Settings, home: OperatorHome, *, read_only: bool = False) -> Inbox:
-    """The inbox that the configuration names. Raises StoreError."""
-    return open_inbox(
+def open_store(config: Settings, home: OperatorHome, *, read_only: bool = False) -> Store:
+    """The store that the configuration names. Raises StoreError."""
+    return opening.open_store(
         config.store.url, home=home.path, ledger=home.deployment().ledger, max_bytes=config.store.max_size,
         max_bytes_per_robot=config.store.share, read_only=read_only,
     )
 
 
 def open_reception(
-    number: int, config: Settings, identity: Identity, home: OperatorHome, registry: Registry, inbox: Inbox,
+    number: int, config: Settings, identity: Identity, home: OperatorHome, registry: Registry, store: Store,
     deployment: Deployment,
 ) -> Reception:  # fmt: skip
     """The door of one worker."""
     channel = ServerConfig(modes=tuple(Mode[mode.upper()] for mode in config.channel), worker=number)
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
-    return Reception(server, inbox, deployment.ledger, registry.in_force)
+    return Reception(server, store, deployment.ledger, registry.in_force)
 
 
-def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Registry, keys: Keyring) -> Submitter:
+def open_submitter(config: Settings, ledger: Ledger, store: Store, registry: Registry, keys: Keyring) -> Submitter:
     """The submitter for all robots of a registry."""
 
     def account(tk: bytes) -> LocalAccount | None:
@@ -111,7 +112,7 @@ def open_submitter(config: Settings, ledger: Ledger, inbox: Inbox, registry: Reg
         return None if found is None else keys.robot(found.number)
 
     return Submitter(
-        ledger, inbox, lambda: registry.robots().keys(), account, keys.operator,
+        ledger, store, lambda: registry.robots().keys(), account, keys.operator,
         SubmitterSettings(
             confirmations=config.chain.confirmations, max_fee=int(config.chain.max_fee_gwei * 10**9),
             low_water=int(config.funds.below * WEI_PER_ETH), top_up=int(config.funds.by * WEI_PER_ETH),
@@ -204,8 +205,8 @@ class Supervisor:
         Registry(self._home.registry).close()
         with closing(Ledger.connect(config.chain.url, self._deployment)) as ledger:
             ledger.check()
-        with closing(open_store(config, self._home)) as inbox:
-            inbox.check()
+        with closing(open_store(config, self._home)) as store:
+            store.check()
 
     def _start(self, name: str, task: Callable[[], None]) -> None:
         self._starts[name] += 1

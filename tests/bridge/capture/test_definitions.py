@@ -150,7 +150,6 @@ def test_a_type_name_that_is_none_is_refused(name):
         "int32[<=] x",
         "int32[2][2] x",
         "int32<=5 x",
-        "string<=99999999999 s",
         "float128 x",
         "wstring x",
         "long x",  # an unknown type of the same package
@@ -158,7 +157,7 @@ def test_a_type_name_that_is_none_is_refused(name):
         "std_msgs/Header h",  # not defined
         "a/b/c/d x",
         "int32 " + "x" * 1000,
-        "string[2000] s",
+        "string[9000] s",
         "uint8[2000000] u",
         "float64[200000] u",
         "@verbatim x",
@@ -217,7 +216,7 @@ def test_arrays_of_nothing_are_refused():
 
 def test_fixed_arrays_may_not_multiply():
     # Each level is small; together they would unroll into 10**9 elements of generated work.
-    with pytest.raises(DefinitionError, match="elements in fixed arrays"):
+    with pytest.raises(DefinitionError, match="comes to more than"):
         read_definition("a/A", definition("B[1000] b", "a/B\nC[1000] c", "a/C\nstring[1000] s"))
 
 
@@ -239,8 +238,8 @@ def test_sizes_are_bounded():
         read_definition("a/A", "#" * (MAX_TEXT + 1))
     with pytest.raises(DefinitionError, match="fields"):
         read_definition("a/A", "\n".join(f"int8 x{i}" for i in range(MAX_FIELDS + 1)))
-    with pytest.raises(DefinitionError, match="types"):
-        read_definition("a/A", definition("int8 x", *[f"a/T{i}\nint8 x" for i in range(300)]))
+    with pytest.raises(DefinitionError, match="longer than"):
+        read_definition("a/A", definition("int8 x", *[f"a/T{i}\nint8 x" for i in range(600)]))
 
 
 def test_a_constant_s_text_never_reaches_generated_code():
@@ -312,7 +311,6 @@ def test_a_tree_from_elsewhere_is_checked_like_text():
         [("x", (Nodetype.BASE, ("int32'", 0)))],
         [("x", (Nodetype.NAME, "a/msg/B'"))],
         [("x", (Nodetype.ARRAY, ((Nodetype.BASE, ("int32", 0)), -1)))],
-        [("x", (Nodetype.BASE, ("string", -1)))],
     ):
         with pytest.raises(DefinitionError):
             check_types("a/msg/A", {"a/msg/A": fields, "a/msg/B'": []})

@@ -15,9 +15,9 @@ from rosbridge_eth.channel.udp import UdpLoop, server_sockets
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
-from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.log.store import Store
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
@@ -48,7 +48,7 @@ class Place:
     def ledger(self) -> Ledger:
         return Ledger.connect(self.chain, self.operator.deployment())
 
-    def inbox(self) -> Inbox:
+    def inbox(self) -> Store:
         return open_store(load_server_config(self.operator.config), self.operator)
 
     def configure(self, old: str, new: str) -> None:

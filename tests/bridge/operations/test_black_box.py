@@ -22,6 +22,8 @@ from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ConfigError, ExitCode
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.store import NOWHERE
 from rosbridge_eth.robot.loop import Robot, open_robot
 from rosbridge_eth.server import metrics
 
@@ -112,7 +114,7 @@ def test_an_event_after_the_end_of_a_bag_is_written_while_the_robot_waits_for_it
     def on_turn() -> None:
         if running._unspooled or running.chunks == 0 or not running._source_ended.is_set() or running._ring:
             return
-        chunks = running.spool.following(running.writer.stream, None, 1 << 30)
+        chunks = [Chunk.parse(running.spool.chunks([row.place])[0]) for row in running.spool.rows(NOWHERE, 10_000)]
         if chunks and chunks[-1].header.goodbye:
             streams.add(chunks[-1].header.stream)
             if len(streams) == 2:

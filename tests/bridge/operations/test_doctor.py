@@ -29,6 +29,7 @@ from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.log import store
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.operator import doctor as checks
 from rosbridge_eth.operator import enrolment as admin
@@ -151,7 +152,7 @@ ODOM = 'topics = ["/robot_1/odom"]\n'
     ("operator", lambda p: (p / "operator/server.toml").write_text("listen = 1"), "configuration", ""),
     ("operator", lambda p: (p / "operator/registry.sqlite").write_bytes(b"no database" * 999), "registry", "backup"),
     ("operator", lambda p: (p / "pass").write_bytes(b"another"), "passphrase", ""),
-    ("operator", lambda p: (p / "operator/inbox.sqlite").write_bytes(b"no database" * 999), "store", ""),
+    ("operator", lambda p: (p / "operator/store.sqlite").write_bytes(b"no database" * 999), "store", ""),
     ("reader", lambda p: (p / "readers").write_bytes(b"another"), "keys", ""),
     ("reader", lambda p: (p / "reader/reader.toml").write_text("x = 1"), "node", ""),
 ])
@@ -454,7 +455,7 @@ def test_another_chain_with_the_same_id_has_its_mend(place: Place, keys: Keyring
 
 def test_what_waits_is_told(place: Place, capsys: Capture):
     inbox, tk = place.inbox(), robot_id("robot_1")
-    inbox.append([(tk, chunk) for chunk in chunk_chain(3)], time.time())
+    inbox.append([store.Offer(tk, chunk) for chunk in chunk_chain(3)], time.time())
     inbox.close()
     _, findings = doctor(capsys)
     assert of(findings, "store")["found"] == "3 chunks wait"
@@ -495,15 +496,15 @@ def test_a_redis_that_is_away_is_told_without_its_password(place: Place, capsys:
 # Homes, and what a person sees
 
 
-def test_what_is_nobodys_home_and_one_of_the_first_edition_are_refused(place: Place, capsys: Capture):
+def test_what_is_no_home_and_one_of_another_edition_are_refused(place: Place, capsys: Capture):
     Path("empty").mkdir()
     Path("old").mkdir()
-    Path("old/server.toml").write_text("listen = 1")
+    Path("old/home.json").write_text('{"format": "rosbridge-eth home 2", "kind": "operator"}')
     for command in ("doctor", "status"):
         assert run([command, "--home", "empty"]) == ExitCode.CONFIG
         assert "not a home" in capsys.readouterr().err
         assert run([command, "--home", "old"]) == ExitCode.CONFIG
-        assert "first edition" in capsys.readouterr().err
+        assert "another version" in capsys.readouterr().err
 
 
 def test_a_person_sees_a_table_and_every_mend(place: Place, capsys: Capture):

@@ -26,6 +26,7 @@ from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.log.store import NOWHERE, Offer
 from rosbridge_eth.operator import doctor
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator import status as module
@@ -68,7 +69,7 @@ def write(place: Place, keys: Keyring) -> Callable[..., None]:
 
 def test_with_node_and_server_away_the_rest_is_shown_and_what_is_not_known_is_said(place: Place, capsys: Capture):
     inbox = place.inbox()
-    inbox.append([(TK, chunk) for chunk in chunk_chain(3, records=7)], time.time() - 60)
+    inbox.append([Offer(TK, chunk) for chunk in chunk_chain(3, records=7)], time.time() - 60)
     inbox.close()
     before = sorted(place.path.rglob("*"))
     report = status(capsys)
@@ -105,7 +106,7 @@ def test_a_revoked_robot_is_no_alarm_unless_some_of_its_chunks_wait(
         now = time.time()
         assert alarms(now) == ([], 0)
         assert [finding.what for finding in doctor.store(place.operator, None)] == ["store"]
-        inbox.append([(TK, chunk) for chunk in chunk_chain(1)], now)
+        inbox.append([Offer(TK, chunk) for chunk in chunk_chain(1)], now)
         assert alarms(now + 1) == (["ALARM: robot_1 is on hold: it is revoked."], 1)
 
 
@@ -118,9 +119,10 @@ def test_accounts_are_on_lines_of_their_own_at_any_width(place: Place, monkeypat
     assert f"{robot.account}  robot_1" in lines and f"{place.operator.account}  operator" in lines
 
 
-def test_without_an_inbox_or_a_contract_it_is_no_trouble(place: Place, capsys: Capture):
+def test_without_a_store_or_a_contract_it_is_no_trouble(place: Place, capsys: Capture):
     report = status(capsys)
-    assert not place.operator.inbox.exists() and not any("inbox" in line for line in report["unknown"])
+    assert not (place.operator.path / "store.sqlite").exists()
+    assert not any("store" in line for line in report["unknown"])
     place.operator.deployment_file.unlink()
     report = status(capsys)
     assert report["contract"] is None and any("deploy" in line for line in report["unknown"])
@@ -246,10 +248,10 @@ def test_no_address_is_broken_at_80_columns(place: Place, monkeypatch: Patch, ca
 
 def test_what_is_on_hold_or_dead_is_told_with_the_reason(place: Place, capsys: Capture):
     inbox = place.inbox()
-    inbox.append([(TK, chunk) for chunk in chunk_chain(4)], time.time())
-    inbox.append([(robot_id("stranger"), chunk) for chunk in chunk_chain(2)], time.time())
+    inbox.append([Offer(TK, chunk) for chunk in chunk_chain(4)], time.time())
+    inbox.append([Offer(robot_id("stranger"), chunk) for chunk in chunk_chain(2)], time.time())
     inbox.set_state(TK, hold="the contract refuses")
-    inbox.bury(TK, inbox.rows(TK, None, 1)[0].position, "given up")
+    inbox.remove(TK, [row.place for row in inbox.rows(TK, NOWHERE, 9)[1:]], "given up")
     inbox.close()
     report = status(capsys)
     assert report["robots"]["robot_1"]["hold"] == "the contract refuses"
@@ -294,7 +296,7 @@ def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: P
             assert "waiting" not in status(capsys)["robots"]["robot_1"]
             assert client.keys() == []
             inbox = place.inbox()
-            inbox.append([(TK, chunk) for chunk in chunk_chain(2)], time.time())
+            inbox.append([Offer(TK, chunk) for chunk in chunk_chain(2)], time.time())
             inbox.close()
             before = {key: client.dump(key) for key in client.scan_iter()}
             assert status(capsys)["robots"]["robot_1"]["waiting"]["chunks"] == 2
@@ -470,7 +472,7 @@ def test_of_one_robot_it_is_said_how_far_its_log_is_written_and_confirmed(
     assert run(["status", "robot_1"]) == 0
     said = capsys.readouterr().out
     assert f"robot_1: confirmed up to chunk 1 of stream {STREAM.hex()}, in block {block - 1}" in said
-    for file in place.path.glob("operator/inbox.sqlite*"):
+    for file in place.path.glob("operator/store.sqlite*"):
         file.unlink()
     assert log()["written"] == second, "the chain alone is enough"
 

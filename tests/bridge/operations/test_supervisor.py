@@ -22,6 +22,7 @@ from rosbridge_eth.cli import run
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.errors import ExitCode, NetworkError, ProcessError, StoreError
 from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import metrics, supervisor
 from rosbridge_eth.server.supervisor import (
     GIVE_UP_AFTER,
@@ -34,7 +35,6 @@ from rosbridge_eth.server.supervisor import (
     notify,
     worker_name,
 )
-from rosbridge_eth.spool import Spool
 
 Pause = Callable[[str, int | None, float], float]
 

@@ -399,8 +399,8 @@ def test_no_block_above_the_one_that_is_read_is_taken(chain, monkeypatch, block)
     chain.write(chain.pen.chunks(1))
     real = contract._standing
     for position in (6, 7):
-        def standing(row: Any, *more: Any, position: int = position) -> Any:
-            return real((*row[:position], block, *row[position + 1 :]), *more)
+        def standing(row: bytes, end: int, at: int = 32 * position) -> Any:
+            return real(row[:at] + block.to_bytes(32, "big") + row[at + 32 :], end)
 
         with monkeypatch.context() as patched:
             patched.setattr(contract, "_standing", standing)
@@ -433,13 +433,13 @@ def test_registrations_without_end_are_refused(chain, monkeypatch):
 def test_blocks_without_batches_cost_few_requests_however_many_a_node_shows(chain, monkeypatch):
     asked: list[int] = []
 
-    def data(self: Ledger, tk: bytes, start: int, end: int) -> Any:
+    def data(self: Ledger, makers: Any, tk: bytes, start: int, end: int) -> Any:
         asked.append(end - start + 1)
         if end - start >= most:
             raise TooMuch("ranges of so many blocks only")
         return []
 
-    monkeypatch.setattr(Ledger, "_data", data)
+    monkeypatch.setattr(Ledger, "_events", data)
     most = contract.MAX_BLOCK
     assert list(chain.ledger.data_events(chain.pen.log.tk, 1, contract.MAX_BLOCK - 1)) == []
     assert len(asked) < 30 and sum(asked) == contract.MAX_BLOCK - 1
@@ -448,7 +448,9 @@ def test_blocks_without_batches_cost_few_requests_however_many_a_node_shows(chai
     assert list(chain.ledger.data_events(chain.pen.log.tk, 1, 10**6)) == []
     assert len(asked) < 10**6 / 4_000 + 10, "what a node refuses is not asked for again and again"
     asked.clear()
-    monkeypatch.setattr(Ledger, "_data", lambda self, tk, start, end: data(self, tk, start, end) if start < 100 else [])
+    monkeypatch.setattr(Ledger, "_events", lambda self, makers, tk, start, end: (
+        data(self, makers, tk, start, end) if start < 100 else []
+    ))  # fmt: skip
     most = 1
     assert list(chain.ledger.data_events(chain.pen.log.tk, 1, 10**6)) == []
     assert len(asked) < 300, "blocks that are too full for more than one at once do not slow down what is behind"

@@ -37,6 +37,7 @@ from rosbridge_eth.reading.outputs import json_line
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 DOCS = Path(__file__).resolve().parents[3] / "docs"
+REST = "src/rosbridge_eth/reading/evidence.js"
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")  # the accounts to which anvil gives ETH
 
 
@@ -44,7 +45,10 @@ KEYS = Keyring.from_mnemonic("test " * 11 + "junk")  # the accounts to which anv
 def verifier(require: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The command, with its packages installed as the lock file pins them."""
     node, npm = require("node"), require("npm")
-    folder = tmp_path_factory.mktemp("verify")
+    folder = tmp_path_factory.mktemp("verify") / "docs"
+    (folder.parent / REST).parent.mkdir(parents=True)
+    shutil.copy(DOCS.parent / REST, folder.parent / REST)
+    folder.mkdir()
     for name in ("verify.mjs", "package.json", "package-lock.json"):
         shutil.copy(DOCS / name, folder)
     try:

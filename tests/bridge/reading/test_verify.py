@@ -250,7 +250,42 @@ def test_two_chunks_with_one_number():
     other = Pen(number=1, previous=first.header.digest, sealed_ms=pen.sealed_ms).write(message(9))
     found = read([first, second, other]).only(Kind.FORKED)
     assert (found.places[0][0], found.count) == (2, 1)
-    assert "follows the chunk of index 0" in found.detail
+    assert "register --replace" in found.detail
+
+
+def test_two_machines_with_one_identity_are_told_in_one_sentence_with_the_remedy():
+    first, second = Pen(), Pen(stream=b"b" * 16)
+    chunks = [pen.write(message(n)) for n in range(100) for pen in (first, second)]
+    verdict = read(chunks).verdict
+    assert verdict.counts["forked"] > 100
+    told = [line for line in verdict.lines() if "forked:" in line and "chunk" in line and "join" in line]
+    assert len(told) == 1 and "another machine has this robot's identity" in told[0]
+
+
+def test_what_stands_behind_a_goodbye_goes_back():
+    pen = Pen()
+    chunks = [*pen.chunks(2, goodbye=True), *pen.chunks(1)]
+    result = read(chunks)
+    assert result.only(Kind.FORKED).places == [(2, 2)] and result.numbers == [0, 1, 2]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_stream_is_named_above_the_one_before(known):
+    pen = Pen(stream=b"b" * 16)
+    chunks = pen.chunks(2, goodbye=True)
+    pen.new_stream(b"a" * 16, None if known else NO_DIGEST)
+    result = read([*chunks, pen.write(message(2))])
+    assert [kind for kind, *_ in result.found] == ["forked"] + ["restarted"] * (not known)
+    assert result.numbers == [0, 1, 2]
+
+
+def test_the_name_of_a_stream_again():
+    pen = Pen()
+    chunks = pen.chunks(2, goodbye=True)
+    pen.new_stream(b"b" * 16)
+    chunks += pen.chunks(2, goodbye=True)
+    pen.new_stream(b"a" * 16)
+    assert read([*chunks, pen.write(message(4))]).only(Kind.FORKED).places == [(4, 4)]
 
 
 def test_a_fork_shows_in_what_follows_even_if_the_other_branch_is_not_written():
@@ -269,7 +304,7 @@ def test_a_restored_disk_goes_on_from_an_older_chunk():
     restored = Pen(stream=b"b" * 16, previous=chunks[1].header.digest, sealed_ms=pen.sealed_ms)
     result = read([*chunks, *restored.chunks(2)])
     assert [(kind, first) for kind, first, *_ in result.found] == [("forked", 5), ("restarted", 5)]
-    assert "index 1" in result.verdict.findings[0].detail
+    assert "disk was put back" in result.verdict.findings[0].detail
 
 
 @pytest.mark.parametrize("again", [[0], [2], [0, 1, 2], [1, 1]])

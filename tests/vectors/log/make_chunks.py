@@ -1,4 +1,4 @@
-"""Makes chunks.json beside it: a log of four chunks, with every input and every value on the way.
+"""Makes chunks.json beside it: a log of six chunks, with every input and every value on the way.
 
 Run from the repository: PYTHONPATH=src python tests/vectors/log/make_chunks.py
 
@@ -111,7 +111,10 @@ def vectors() -> dict[str, Any]:
         "signed": (b"rosbridge-eth/2 dropped\0" + LOG.ledger + LOG.tk + dropped.header.encoded).hex(),
         "signature": dropped.signature.hex(), "chunk": dropped.encoded.hex(),
     }  # fmt: skip
-    _, silent = make("heartbeat, nothing to say", [], 1, 1, packed.header.digest)
+    silence, silent = make("heartbeat, nothing to say", [], 1, 1, packed.header.digest)
+    alone, one = make("one line", [message(24)], 1, 2, silence.header.digest, readers=1, prove=0)
+    lost = [b'{"lost":%d,"topic":"/t","why":"w"}' % n for n in range(1, 1001)]
+    _, many = make("a thousand lines", lost, 1, 3, alone.header.digest, compress=True, readers=1, prove=999)
     return {
         "generator": "make_chunks.py",
         "verified_with": "tests/bridge/log/test_vectors.py: textbook SM2 on affine points, SM3 of OpenSSL, "
@@ -125,7 +128,7 @@ def vectors() -> dict[str, Any]:
             "chain_id": CHAIN_ID, "genesis": GENESIS.hex(), "contract": CONTRACT.hex(), "ledger": LOG.ledger.hex(),
         },
         "reader_keys": [reader.to_bytes().hex() for reader in READERS],
-        "tests": [first, last, second, silent],
+        "tests": [first, last, second, silent, one, many],
     }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from bridge.chunks import STREAM, chain, chunk, dropped
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk, Log
 from rosbridge_eth.log.database import DiskFull
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.log.store import NOWHERE
+from rosbridge_eth.robot.spool import Spool
 
 LOG = Log(b"l" * 32, b"r" * 32)
 PLENTY = 1 << 30
@@ -29,7 +30,11 @@ def open_spool(path: Path, max_bytes: int = PLENTY) -> Spool:
 
 
 def all_of(spool: Spool) -> list[Chunk]:
-    return spool.following(STREAM, None, PLENTY)
+    return [Chunk.parse(one) for one in spool.chunks([row.place for row in spool.rows(NOWHERE, PLENTY)])]
+
+
+def at(number: int, stream: bytes = STREAM) -> bytes:
+    return stream + number.to_bytes(8, "big")
 
 
 def numbers(chunks: list[Chunk]) -> list[int]:
@@ -73,7 +78,7 @@ def test_a_log_cut_at_any_place_holds_whole_appends_and_all_that_returned_before
         (copy / "spool.sqlite-wal").write_bytes(log[:cut])
         again = open_spool(copy / "spool.sqlite", 9000)
         _, chunks, last, statistics = [state for state in returned if state[0] <= cut][-1]
-        assert (all_of(again), again.last_digest, again.statistics()) == (chunks, last, statistics)
+        assert (all_of(again), again.last_digest, again.statistics()[:5]) == (chunks, last, statistics[:5])
         again.close()
         shutil.rmtree(copy)
 
@@ -83,17 +88,17 @@ import sys
 from pathlib import Path
 from bridge.chunks import chain, dropped
 from rosbridge_eth.log.chunk import Log
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 spool = Spool(Path(sys.argv[1]), Log({LOG.ledger!r}, {LOG.tk!r}), max_bytes=20_000, drop=dropped)
 for number, one in enumerate(chain(100_000, size=1000)):
     print("next", number, one.header.digest.hex(), flush=True)
     spool.append(one)
     print("kept", number, one.header.digest.hex(), flush=True)
     if number % 3 == 0:
-        spool.stored({STREAM!r}, number - 2 if number > 2 else 0)
+        spool.stored({STREAM!r} + max(number - 2, 0).to_bytes(8, "big"))
     if number % 7 == 0 and number:
         print("gone", number - 5, flush=True)
-        spool.confirmed({STREAM!r}, number - 5)
+        spool.confirmed({STREAM!r} + (number - 5).to_bytes(8, "big"))
 """
 
 
@@ -148,13 +153,13 @@ def test_a_disk_that_the_spool_itself_fills_takes_the_new_at_the_expense_of_the_
     spool.close()
     spool = open_spool(disk / "spool.sqlite")  # the robot may be started again in this state
     assert all_of(spool) == found
-    spool.stored(STREAM, 1450)
+    spool.stored(at(1450))
     assert spool.statistics().unstored == 49
     for number in range(1300, 1500, 7):
-        spool.confirmed(STREAM, number)
-    spool.confirmed(STREAM, 1499)
-    assert (spool.next_stream(b""), spool.last_digest) == (None, found[-1].header.digest)
-    for one in chain(100, b"2" * 16, size=8000):
+        spool.confirmed(at(number))
+    spool.confirmed(at(1499))
+    assert (all_of(spool), spool.last_digest) == ([], found[-1].header.digest)
+    for one in chain(100, b"t" * 16, size=8000):
         spool.append(one)
     assert spool.statistics().chunks == 100
     spool.close()
@@ -177,18 +182,17 @@ def test_a_disk_that_others_fill_is_survived_and_everything_that_was_kept_stays_
     spool = open_spool(disk / "spool.sqlite")
     assert all_of(spool) == found
     ballast.unlink()
-    more = list(chain(100, b"2" * 16, size=4000))
+    more = list(chain(100, b"t" * 16, size=4000))
     for one in more:
         spool.append(one)
-    assert spool.following(b"2" * 16, None, PLENTY) == more
-    assert all_of(spool) == found
+    assert all_of(spool) == found + more
     spool.close()
 
 
 def test_where_not_even_old_ones_make_room_it_says_so_changes_nothing_and_goes_on_later(disk):
     spool = open_spool(disk / "spool.sqlite")
     made = list(chain(3, size=60_000))
-    spool.append(chunk(0, b"2" * 16, size=500))
+    spool.append(chunk(0, b"e" * 16, size=500))
     ballast = disks.fill_up(disk)
     (disk / "spool.sqlite.reserve").unlink()
     disks.fill_up(disk)
@@ -202,7 +206,7 @@ def test_where_not_even_old_ones_make_room_it_says_so_changes_nothing_and_goes_o
     ballast.unlink()
     for one in made[0 if kept != made[0].header.digest else 1 :]:
         spool.append(one)
-    assert all_of(spool) == made
+    assert all_of(spool)[-3:] == made
     spool.close()
 
 
@@ -244,12 +248,12 @@ def test_a_disk_that_becomes_read_only_can_still_be_read(tmp_path):
     made = list(chain(3))
     for one in made[:2]:
         spool.append(one)
-    spool._db.run("PRAGMA query_only = ON")  # SQLite's own refusal, the one that a read-only file gets
-    for write in (lambda: spool.append(made[2]), lambda: spool.confirmed(STREAM, 1), lambda: spool.stored(STREAM, 1)):
+    spool._store._db.run("PRAGMA query_only = ON")  # SQLite's own refusal, the one that a read-only file gets
+    for write in (lambda: spool.append(made[2]), lambda: spool.confirmed(at(1)), lambda: spool.stored(at(1))):
         with pytest.raises(StoreError, match=r"readonly.*what was kept before is safe"):
             write()
     assert all_of(spool) == made[:2]
-    spool._db.run("PRAGMA query_only = OFF")
+    spool._store._db.run("PRAGMA query_only = OFF")
     spool.append(made[2])
     assert all_of(spool) == made
     spool.close()
