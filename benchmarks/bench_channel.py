@@ -216,8 +216,9 @@ def links(seeds: int, commit: str | None) -> None:
     subprocess.run(program, env={**os.environ, "PYTHONPATH": f"{here}/src:{here}/tests"}, check=True)
     if commit is not None:
         with tempfile.TemporaryDirectory() as there:
-            archive = subprocess.run(["git", "archive", commit, "src", "tests"], cwd=here, check=True, capture_output=True)
-            subprocess.run(["tar", "x", "-C", there], input=archive.stdout, check=True)
+            archive = ["git", "archive", "--output", f"{there}/sources.tar", commit, "src", "tests"]
+            subprocess.run(archive, cwd=here, check=True)
+            subprocess.run(["tar", "xf", "sources.tar"], cwd=there, check=True)
             print(f"\nthe same at {commit}", flush=True)
             subprocess.run(program, env={**os.environ, "PYTHONPATH": f"{there}/src:{there}/tests"}, check=True)
 

@@ -22,13 +22,13 @@ def first_chunk(loss: float, round_trip: float, seed: int) -> float:
     heard, times = robot.host.on_event, list[float]()
 
     def note(event: object) -> None:
-        heard(event)  # type: ignore[arg-type]
+        heard(event)
         if robot.sent is not None:
             times.append(network.now - 1000.0)
 
     robot.host.on_event = note
     network.run(lambda: bool(times))
-    return times[0]
+    return float(times[0])
 
 
 def rate(loss: float, round_trip: float) -> float:
@@ -39,7 +39,7 @@ def rate(loss: float, round_trip: float) -> float:
     network.run(lambda: robot.sent is not None)
     began, stored = network.now, hub.stored.setdefault("robot_1", [])
     network.run(lambda: network.now > began + 30.0 or len(stored) > 1500)
-    return len(stored) * CHUNK / (network.now - began) / 1e3
+    return float(len(stored) * CHUNK / (network.now - began) / 1e3)
 
 
 def main(seeds: int) -> None:

@@ -46,7 +46,7 @@ def test_more_robots_than_their_address_may_fail_at_once_wait_and_get_in(
 ) -> None:
     """The caps on strangers delay honest robots behind one address, and keep none of them out."""
     monkeypatch.setattr(supervisor, "ServerConfig", partial(
-        ServerConfig, max_half_open=4, source_rate=1.0, source_burst=3.0))  # fmt: skip
+        ServerConfig, max_half_open=4))  # fmt: skip
     operator = load.Operator(tmp_path, "embedded", "sqlite", 24, lambda stage: None)
     try:
         figures = load.run(operator, 24, 2, workers=1, limit=120)

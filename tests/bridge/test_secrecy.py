@@ -76,7 +76,7 @@ class Seen:
 
         def secrets_of_session(*arguments: Any) -> SessionSecrets:
             made = SessionSecrets(*arguments)
-            seen.session_keys += [made.client, made.server, made.client_finished, made.server_finished]
+            seen.session_keys += [made.client, made.server, made.finished]
             return made
 
         class Kept(nodes.EmbeddedChain):
