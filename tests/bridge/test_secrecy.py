@@ -155,7 +155,7 @@ def telltales(result: DemoResult) -> set[bytes]:
 
 def test_the_run_was_harmed_and_still_complete(seen: Seen) -> None:
     assert seen.result.passed
-    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 8
+    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 6
     assert len(seen.keys) > 20
 
 
