@@ -139,6 +139,8 @@ class Sender:
         if state.confirmed > self.newest:
             self.newest, self.block = state.confirmed, state.block
         self.state = state
+        log.debug("stream %s: the server has it up to %d", state.head[:STREAM_SIZE].hex(),
+                  int.from_bytes(state.head[STREAM_SIZE:], "big"))
         self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
         if state.why:
             self._warn(state.why, f"the server takes nothing at this moment: {state.why}", now)
