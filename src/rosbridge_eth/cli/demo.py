@@ -27,13 +27,12 @@ from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
-from rosbridge_eth.logs import log_to_stderr
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
 from rosbridge_eth.robot.sources import sample_bag
 from rosbridge_eth.robot.topics import robot_toml
-from rosbridge_eth.terminal import data, errors, table, talk
+from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.cli.relay import Harm
@@ -253,10 +252,10 @@ def demo(
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
-    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as line:
+    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
         def show(stages: Stages) -> None:
-            line.update(f"{stages.captured} records captured, {stages.stored} lines stored by the server")
+            progress.update(f"{stages.captured} records captured, {stages.stored} lines stored by the server")
 
         result = run_demo(
             Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),

@@ -32,11 +32,11 @@ from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
 from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
 from rosbridge_eth.robot.spool import Spool
+from rosbridge_eth.terminal import Trouble
 from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)

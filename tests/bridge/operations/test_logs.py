@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.logs import LogFormat, Trouble, log_to_stderr, speaks_json
+from rosbridge_eth.terminal import LogFormat, Trouble, log_to_stderr, speaks_json
 
 log = logging.getLogger("rosbridge_eth.server.reception")
 
