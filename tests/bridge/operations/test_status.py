@@ -377,7 +377,7 @@ def test_what_a_robot_left_in_the_store_of_another_shard_is_not_counted(place: P
     tk = int.from_bytes(TK, "big")
     place.configure('"127.0.0.1:0"', '"127.0.0.1:7410"')
     inbox = place.inbox()
-    inbox.append([(TK, chunk) for chunk in chunk_chain(3)], time.time())
+    inbox.append([Offer(TK, chunk) for chunk in chunk_chain(3)], time.time())
     inbox.close()
     assert status(capsys)["robots"]["robot_1"]["waiting"]["chunks"] == 3
     shards = next(number for number in range(2, 64) if tk % number)
