@@ -153,7 +153,7 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], 
 
 
 class Trouble:
-    """One thing that may fail and be well again: each change is logged once, the return to health too.
+    """One thing that may fail and work again: each change is logged once, in both directions.
 
     what: the sentence's subject, such as "the node".
     """
@@ -167,7 +167,7 @@ class Trouble:
         if why is not None and why != self.why:
             self._log.error("%s: %s", self._what, why)
         elif why is None and self.why is not None:
-            self._log.warning("%s: well again", self._what)
+            self._log.warning("%s: works again", self._what)
         self.why = why
 
 

@@ -298,7 +298,7 @@ class Robot:
     def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
         """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
 
-        A spool may do one thing and not another: it is well again when all that it did not do is done.
+        A spool may do one thing and not another: it works again when all that it did not do is done.
         """
         try:
             given = call()
