@@ -101,9 +101,9 @@ def init_home(
     require_empty(home.path)
     require_empty(reader.path)
     try:
-        door = parse_address(listen)
+        address = parse_address(listen)
         text = server_toml(
-            door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file,
+            address, own_address(address) if public is None else parse_address(public), chain_url, server, passphrase_file,
         )
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
@@ -479,5 +479,5 @@ def revoke(
     except (ChainError, StoreError) as error:
         raise type(error)(
             f"half done: the server takes nothing from {name} any more, but chain or store did not follow ({error});"
-            f" run `revoke {name}` again when that is mended"
+            f" run `revoke {name}` again when they answer"
         ) from error
