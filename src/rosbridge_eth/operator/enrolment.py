@@ -102,9 +102,8 @@ def init_home(
     require_empty(reader.path)
     try:
         address = parse_address(listen)
-        text = server_toml(
-            address, own_address(address) if public is None else parse_address(public), chain_url, server, passphrase_file,
-        )
+        told = own_address(address) if public is None else parse_address(public)
+        text = server_toml(address, told, chain_url, server, passphrase_file)
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
     parse_config(ServerConfig, text, home.config)
