@@ -456,6 +456,20 @@ def test_a_robot_whose_certificates_the_contract_does_not_have_is_told_so(tmp_pa
     assert world.stored_lines() == world.lines
 
 
+def test_a_robot_that_was_revoked_after_the_registrys_backup_is_told_so_and_nothing_of_it_is_taken(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The registry still has it in force, the submitter has seen the contract's word."""
+    world = World(tmp_path, 6, Faults())
+    world.store.set_state(PLACE.tk, certificates=bytes(32))
+    world.robot.capture(5)
+    assert world.run(60, until=lambda: world.sender.held == MISMATCH)
+    world.pass_time(30)
+    assert world.stored() == [] and not world.sender.idle
+    assert caplog.messages.count(f"robot robot_1: {MISMATCH}") == 1
+    assert "registry is an older copy" in MISMATCH and "node is behind" in MISMATCH
+
+
 def test_a_session_of_somebody_who_is_revoked_ends_within_two_seconds(tmp_path: Path) -> None:
     world = World(tmp_path, 8, Faults())
     world.robot.capture(5)

@@ -41,7 +41,10 @@ WELL_AFTER = 3 * HELD  # seconds without a failed commit, after which a store th
 LONGEST_WAIT = 0.5
 ALIVE = 10.0  # seconds after its last message in which a session counts as alive
 SAY_AGAIN = 60.0  # seconds before the same is logged of a robot once more
-MISMATCH = "the contract has other certificates for this robot; the operator's `status` says more"
+MISMATCH = (
+    "the chain has this robot revoked or with other certificates: the server's node is behind, or its registry is an"
+    " older copy; the operator's `status` says which"
+)
 AWAY = "the server's store is away"
 NO_ROOM = "the room for this robot's chunks is full until some are on the chain"
 REPLACED = (
@@ -208,6 +211,8 @@ class Reception:
                 session.state = state
                 if now >= session.until:
                     session.why = "" if state.certificates in (b"", session.certificates) else MISMATCH
+                if session.why == MISMATCH:
+                    self._tell(session, MISMATCH, now)
                 if session.why == FORKED:
                     self._fork(session, now)
             if now - self._failed_at > WELL_AFTER:
