@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.store import Store
 
 
@@ -20,4 +19,6 @@ def open_store(
         from rosbridge_eth.log.sqlite import SqliteStore
 
         return SqliteStore(home / "store.sqlite", ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
-    raise StoreError("[store] url: only \"sqlite\" is known")
+    from rosbridge_eth.log.redis import RedisStore
+
+    return RedisStore(url, ledger, max_bytes, max_bytes_per_robot)

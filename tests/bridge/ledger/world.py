@@ -12,7 +12,7 @@ from bridge.ledger.model_chain import ModelChain
 from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
 from rosbridge_eth.log.sqlite import SqliteStore
-from rosbridge_eth.log.store import NO_DIGEST, NOWHERE, Offer, Outcome, State, place_of
+from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, State, place_of
 from rosbridge_eth.server.submitter import Settings, Submitter
 from smcrypto import sm2
 
@@ -61,13 +61,10 @@ class Pen:
     def chunks(self, count: int, size: int = 0) -> list[Chunk]:
         return [self.chunk(size) for _ in range(count)]
 
-    def offers(self, chunks: Sequence[Chunk], front: bytes = NO_DIGEST) -> list[Offer]:
-        """front: the digest of the store's head. What is not on the disk any more is no reason to wait."""
-        here, offers = {chunk.header.digest for chunk in self.disk}, list[Offer]()
-        for chunk in chunks:
-            offers.append(Offer(self.tk, chunk, b"" if chunk.header.previous in here else front))
-            front = chunk.header.digest
-        return offers
+    def offers(self, chunks: Sequence[Chunk], head: bytes) -> list[Offer]:
+        """These, behind the head with this digest."""
+        before = [head, *(chunk.header.digest for chunk in chunks)]
+        return [Offer(self.tk, *each) for each in zip(chunks, before, strict=False)]
 
     def told(self, state: State) -> list[Offer]:
         """What it sends when the server says this: what follows the head."""
@@ -147,8 +144,7 @@ class World:
         return self.submitter
 
     def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> list[Outcome]:
-        pen = pen or self.pen
-        return self.store.append(pen.offers(chunks, self.state(pen).digest), self.now)
+        return self.store.append((pen or self.pen).offers(chunks, self.state(pen).digest), self.now)
 
     def talk(self, pen: Pen | None = None) -> list[Outcome]:
         """The robot is told the state, and sends what follows; not before the chain was asked."""
