@@ -18,6 +18,7 @@ from eth_hash.auto import keccak
 from bridge.channel.simulation import Faults
 from bridge.ledger.model_chain import ModelChain
 from bridge.log.backends import BACKENDS, Backend
+from bridge.redis_server import RedisServer
 from bridge.test_delivery import PLACE, World, identity
 from rosbridge_eth.identity import Role
 from rosbridge_eth.ledger import Keyring, Ledger
@@ -79,10 +80,15 @@ class Site(World):
         raise AssertionError((self.sender.held, self.submitter.trouble, self.store.states([PLACE.tk])))
 
 
-@pytest.fixture(params=["sqlite", "redis"])
+@pytest.fixture(scope="module")
+def redis_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RedisServer]:
+    server = RedisServer(tmp_path_factory.mktemp("redis"))
+    yield server
+    server.kill()
+
+
+@pytest.fixture(params=["sqlite", pytest.param("redis", marks=pytest.mark.service)])
 def backend(request: pytest.FixtureRequest, tmp_path: Path) -> Backend:
-    if request.param not in BACKENDS:
-        pytest.skip(f"no back end {request.param}")
     return BACKENDS[request.param](tmp_path, request.getfixturevalue)
 
 
