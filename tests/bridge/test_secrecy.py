@@ -27,8 +27,8 @@ from rosbridge_eth.cli.relay import Harm
 from rosbridge_eth.identity import load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger, nodes
 from rosbridge_eth.log.chunk import MAX_READERS, Chunk, content_key, robot_id
-from rosbridge_eth.logs import LOGGER, TextFormatter
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.terminal import LOGGER, TextFormatter
 from smcrypto import sm2
 
 PLACES = ("network", "chain", "operator's home", "spool", "logs")
@@ -76,7 +76,7 @@ class Seen:
 
         def secrets_of_session(*arguments: Any) -> SessionSecrets:
             made = SessionSecrets(*arguments)
-            seen.session_keys += [made.client, made.server, made.client_finished, made.server_finished]
+            seen.session_keys += [made.client, made.server, made.finished]
             return made
 
         class Kept(nodes.EmbeddedChain):
@@ -155,7 +155,7 @@ def telltales(result: DemoResult) -> set[bytes]:
 
 def test_the_run_was_harmed_and_still_complete(seen: Seen) -> None:
     assert seen.result.passed
-    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 8
+    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 6
     assert len(seen.keys) > 20
 
 
