@@ -1,6 +1,6 @@
 """A Redis that is killed, flushed or exchanged under the running server: nothing lost, nothing doubled, and it is said.
 
-A server as an operator starts it (`python -m rosbridge_eth server`, two workers), a node, a Redis, and robots with
+A server as an operator starts it (`python -m rosbridge_eth server`), a node, a Redis, and robots with
 sockets of their own (benchmarks/load.py); at the end every log is read back from the chain.
 """
 
@@ -45,8 +45,7 @@ class Site:
         secret.chmod(0o600)
         self.program = faults.Program(
             folder / "server.log",
-            ["server", "--home", str(self.operator.home.path), "--passphrase-file", str(secret), "--workers", "2",
-             "--verbose"], {},
+            ["server", "--home", str(self.operator.home.path), "--passphrase-file", str(secret), "--verbose"], {},
         )  # fmt: skip
         faults.until("the server listens", lambda: "Listening on" in self.program.said or self.program.ended())
         address = ("127.0.0.1", port)

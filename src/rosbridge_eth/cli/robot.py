@@ -157,7 +157,7 @@ def robot(
     """
     from rosbridge_eth.robot.loop import open_robot, read_again
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.supervisor import Beats, notify
+    from rosbridge_eth.server.parent import notify
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
@@ -172,7 +172,7 @@ def robot(
     again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
         running = open_robot(place, settings, password)  # a second robot gets no further: the spool is in use
-        stack.enter_context(metrics.shared(home))
+        stack.callback(metrics.file_of(home, "robot").unlink, missing_ok=True)
         _asked_for(place, running.box.triggers)  # when nobody was there to take it
 
         def on_signal(number: int, frame: FrameType | None) -> None:
@@ -185,12 +185,9 @@ def robot(
 
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
             signal.signal(number, on_signal)
-        if settings.monitor is not None:
-            web = metrics.Web(settings.monitor, ["robot"])
-            web.start()
-            stack.callback(web.stop)
-        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
-        beats, rates, told = Beats(), metrics.Rates(), not errors.is_terminal
+        stack.enter_context(metrics.served(settings.monitor))
+        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.addresses()[0]}; Ctrl-C ends it.")
+        beats, rates, told = metrics.Beats(1.0), metrics.Rates(), not errors.is_terminal
         show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
 
         def on_turn() -> None:
@@ -212,6 +209,7 @@ def robot(
                         before = " or before" if any(newest[STREAM_SIZE:]) else ""
                         talk(f"The first record is in block {block}{before}.")
                     metrics.show_robot(end.robot, running, time.time())
+                    metrics.save(metrics.file_of(home, "robot"))
                 show()
 
         notify("READY=1")
@@ -229,10 +227,10 @@ def trigger(
 
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
-    try:
-        known = [labels["trigger"] for what, labels, _ in metrics.figures(home) if what == "trigger_fired"]
-    except ValueError:
-        raise nobody from None
+    figures = metrics.running(home).get("robot")
+    if figures is None:
+        raise nobody
+    known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]
     if not known or (name is not None and name not in known):
         raise ConfigError(f"the robot has no trigger{f' {name}' if name else ''}; it has: {', '.join(known) or 'none'}")
     wanted = known if name is None else [name]

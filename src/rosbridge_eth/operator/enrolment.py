@@ -338,7 +338,8 @@ def register_robot(
     if request and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
     there = home.deployment()
-    end = BridgeEnd(name, config.name, str(config.address_for_robots()), there.chain_id, there.genesis, there.contract)
+    servers = [str(address) for address in config.addresses()]
+    end = BridgeEnd(name, config.name, servers, there.chain_id, there.genesis, there.contract)
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:

@@ -26,7 +26,7 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, parse_address, time_text
+from rosbridge_eth.config.values import Address, counted, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
@@ -68,11 +68,11 @@ class Robot:
     """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
 
     def __init__(
-        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, server: Address,
-        sender: Sender, box: BlackBox | None = None,
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client,
+        servers: Sequence[Address], sender: Sender, box: BlackBox | None = None,
     ) -> None:  # fmt: skip
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
-        self.client, self.sender, self.loop = client, sender, ClientLoop(client, server, self.handle)
+        self.client, self.sender, self.loop = client, sender, ClientLoop(client, servers, self.handle)
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
@@ -417,7 +417,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     sender = Sender(client, spool, writer, channel=config.channel, on_server_time=partial(keep_time, home))
     return Robot(
         source=source, capture=capture, writer=writer, spool=spool, client=client,
-        server=config.server or parse_address(end.server_address), sender=sender, box=box,
+        servers=[config.server] if config.server else end.addresses(), sender=sender, box=box,
     )
 
 
