@@ -66,7 +66,7 @@ def test_it_checks_itself_and_shows_the_record_and_what_it_proves(browser: Brows
         assert line in said
     assert "What it does not prove" in said and "there are no other records" in said
     assert grouped(found.authorities[0]) in said and found.contract in said and found.genesis in said
-    assert all(f"0x{each.written.transaction.hex()}" in said for each in found.records)
+    assert all(f"0x{each.place.transaction.hex()}" in said for each in found.records)
     assert "2026-11-22T10:06:45.000Z" in said and "pose.pose.position.x" in said
     assert str(found.records[0].content.data["pose"]["pose"]["position"]["x"]) in said
     assert "✗" not in said and browser.said == []
