@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rosbridge_eth.capture import MessageLine, parse_line
 
 from rosbridge_eth.log.chunk import (  # isort: skip
-    Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id, verify_signature,
+    Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id, verify as verify_chunk,
 )  # fmt: skip
 from rosbridge_eth.config.values import counted, time_text
 from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
@@ -91,10 +91,14 @@ class Written(_Part):
 
 
 class Evidence(_Part):
-    """What the file holds. certificates: the robot's, each signing and encryption, as they were registered."""
+    """What the file holds. tk: keccak256 of the robot's name, so that a page without keccak can check its signatures.
+
+    certificates: the robot's, each signing and encryption, as they were registered.
+    """
 
     format: Literal["rosbridge-eth evidence 3"] = FORMAT
     robot: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$")]
+    tk: Hex32
     chain_id: Count
     genesis: Hex32
     contract: Annotated[bytes, Field(min_length=20, max_length=20)]
@@ -105,7 +109,7 @@ class Evidence(_Part):
 
     @property
     def log(self) -> Log:
-        return Log(ledger_id(self.chain_id, self.genesis, self.contract), robot_id(self.robot))
+        return Log(ledger_id(self.chain_id, self.genesis, self.contract), self.tk)
 
     def encode(self) -> str:
         """The one form: ASCII without spaces, members as above; "<" is escaped, so that no page can end in it."""
@@ -220,6 +224,8 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
     told: is given a line for each check that held. Nothing is shown that no check needed.
     """
     e = evidence
+    if e.tk != robot_id(e.robot):
+        raise VerificationError(f"the chunks are not of the log of {e.robot}")
     trusted = [root for root in roots if root.to_der() in e.authorities]
     if len(trusted) != len(e.authorities) or not _ascend(e.authorities):
         raise VerificationError(f"the evidence is under another CA, {_fingerprints(e.authorities)}")
@@ -248,16 +254,14 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
 
 
 def _header(log: Log, written: Written, signers: Sequence[tuple[sm2.PublicKey, int, int]]) -> Header:
-    """The header of a chunk that the robot signed, sealed before its certificate ended, and that is in its batch."""
+    """The header of a chunk that the robot signed, sealed before its certificate ended."""
     place = written.chunk - written.first
     if written.certificate >= len(signers) or not 0 <= place < len(written.hashes):
-        raise VerificationError(f"chunk {written.chunk} is of no certificate or batch")
-    if written.hashes[place] != keccak(written.encoded):
-        raise VerificationError(f"chunk {written.chunk} is not the one that its batch has there")
+        raise VerificationError(f"chunk {written.chunk} is of no certificate, or of no batch")
     key, _, ends = signers[written.certificate]
     try:
         chunk = Chunk.parse(written.encoded)
-        verify_signature(log, key, chunk)
+        verify_chunk(log, key, chunk)
     except VerificationError as error:
         raise VerificationError(f"chunk {written.chunk}: {shown(str(error))}") from None
     if chunk.header.sealed_ms > ends:
@@ -369,7 +373,7 @@ def _made(reading: Reading, records: Sequence[ProvenRecord]) -> Evidence:
             for one in proofs(lines, key, sorted(numbers[index]))
         ]
     return Evidence(
-        robot=reading.verifier.name, chain_id=ledger.chain_id, genesis=ledger.genesis,
+        robot=reading.verifier.name, tk=log.tk, chain_id=ledger.chain_id, genesis=ledger.genesis,
         contract=bytes.fromhex(ledger.contract[2:]), authorities=sorted(root.to_der() for root in reading.trust.roots),
         certificates=certificates, chunks=chunks, records=shown_records,
     )  # fmt: skip

@@ -10,7 +10,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bridge.log.making import sealed
-from rosbridge_eth.log.chunk import zstd
 from rosbridge_eth.protocol import Confirmed, Hold, Offer, Refused, Stored, Where, encode
 
 PATH = Path(__file__).resolve().parents[3] / "fuzz" / "bridge_parsers.py"
@@ -25,9 +24,10 @@ CHUNK = parsers.chunks.seal(
 )  # fmt: skip
 STREAM, DIGEST = bytes(range(16)), bytes(range(32))
 INPUTS = [
-    CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, zstd.compress(b"one\ntwo\n") + bytes(20),
-    zstd.compress(b"one\n" + b"a" * 70_000 + b"\n"), encode(Where(STREAM, 1, DIGEST)), encode(Offer(CHUNK.encoded)),
-    encode(Stored(STREAM, 1, DIGEST)), encode(Stored(STREAM, None, bytes(32))), encode(Confirmed(STREAM, 1, 2)),
+    CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, parsers.chunks._compressed(b"one\ntwo\n", 3) + bytes(20),
+    parsers.chunks._compressed(b"one\n" + b"a" * 70_000 + b"\n", 3), encode(Where(STREAM, 1, DIGEST)),
+    encode(Offer(CHUNK.encoded)), encode(Stored(STREAM, 1, DIGEST)),
+    encode(Stored(STREAM, None, bytes(32))), encode(Confirmed(STREAM, 1, 2)),
     encode(Hold("why")), encode(Refused(STREAM, 1, "größer")),
 ]  # fmt: skip
 
