@@ -39,19 +39,20 @@ from eth_hash.auto import keccak
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import Address
-from rosbridge_eth.inbox.sqlite import SqliteInbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.sqlite import SqliteStore
+from rosbridge_eth.log.store import Store
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.loop import TAKE, Robot
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server.reception import Reception, Worker
-from rosbridge_eth.spool import Spool
 
 TOPIC = "/robot_1/odom"
 POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pose", "twist.twist")
@@ -79,9 +80,9 @@ class Identities:
             stream_line=stream_line("bag", "benchmark"), period=period, now=now,
         )
 
-    def reception(self, inbox: SqliteInbox) -> Reception:
+    def reception(self, store: Store) -> Reception:
         server = Server(ServerConfig(), self.server, self.trust, cookie_key(self.server), time.monotonic())
-        return Reception(server, inbox, LEDGER, lambda: {PLACE.tk: keccak(self.robot.public.certificates)})
+        return Reception(server, store, LEDGER, lambda: {PLACE.tk: keccak(self.robot.public.certificates)})
 
 
 class Odometry:
@@ -138,19 +139,19 @@ def stage_costs(
     turn: messages between two turns of the network; by default as the robot's loop turns while messages come in.
     """
     watch = watch or Stopwatch()
-    spool, inbox = who.spool(folder / "spool.sqlite"), SqliteInbox(folder / "inbox.sqlite", LEDGER, GIB, GIB)
+    spool, store = who.spool(folder / "spool.sqlite"), SqliteStore(folder / "store.sqlite", LEDGER, GIB, GIB)
     now = time.monotonic()
     capture, writer = Capture([rule(whole)], source_kind="bag"), who.writer(1.0, now)
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
-    reception = who.reception(inbox)
-    server, sender = reception.server, Sender(client, spool)
+    reception = who.reception(store)
+    server, sender = reception.server, Sender(client, spool, writer)
     there, back = ("192.0.2.1", 7410), ("192.0.2.2", 5000)
     client.connect(there, now)
 
     def exchange(watch: Stopwatch) -> None:
         now = time.monotonic()
         with watch("robot: send"):
-            sender.send()
+            sender.send(now)
             client.handle_timer(now)
             sent = client.datagrams_to_send(now)
         with watch("server: receive and open"):
@@ -170,7 +171,7 @@ def stage_costs(
                 sender.handle(event, now)
 
     unmeasured = Stopwatch()
-    while not sender.statistics.connected:
+    while not sender.connected:
         exchange(unmeasured)
     chunks: list[Chunk] = []
     number, messages = 0, iter(Odometry(records))
@@ -194,7 +195,7 @@ def stage_costs(
     while not sender.idle:
         exchange(watch)
     spool.close()
-    inbox.close()
+    store.close()
     costs: dict[str, dict[str, tuple[float, float]]] = {"robot": {}, "server": {}}
     for stage, seconds in watch.seconds.items():
         end, _, what = stage.partition(": ")
@@ -223,26 +224,27 @@ def gas(chunks: list[Chunk]) -> float:
 def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tuple[float, float, int]:
     """From the source to the server's commit, two processes on loopback.
 
-    Records a second, records in a chunk, and lines in the inbox: the records, and those that open the stream.
+    Records a second, records in a chunk, and lines in the store: the records, and those that open the stream.
     """
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     port = sock.getsockname()[1]
     context = multiprocessing.get_context("fork")
     stop = context.Event()
 
     def serve() -> None:
-        reception = who.reception(SqliteInbox(folder / "inbox-2.sqlite", LEDGER, GIB, GIB))
+        reception = who.reception(SqliteStore(folder / "store-2.sqlite", LEDGER, GIB, GIB))
         Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)).run(stop.is_set)
 
     serving = context.Process(target=serve)
     serving.start()
     spool, now = who.spool(folder / "spool-2.sqlite"), time.monotonic()
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
-    sender = Sender(client, spool)
+    writer = who.writer(0.05, now)
+    sender = Sender(client, spool, writer)
     robot = Robot(
         source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
-        writer=who.writer(0.05, now), spool=spool, client=client, sender=sender,
-        server=Address("127.0.0.1", port),
+        writer=writer, spool=spool, client=client, sender=sender,
+        servers=[Address("127.0.0.1", port)],
     )  # fmt: skip
     started = time.perf_counter()
     robot.run()
@@ -251,9 +253,9 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     serving.join(10)
     if robot.captured < records:
         raise SystemExit(f"only {robot.captured} of {records} were captured: {robot.summary}")
-    inbox = SqliteInbox(folder / "inbox-2.sqlite", LEDGER, GIB, GIB)
-    stored = inbox.totals()[PLACE.tk].records
-    inbox.close()
+    store = SqliteStore(folder / "store-2.sqlite", LEDGER, GIB, GIB)
+    stored = store.waiting(PLACE.tk).records
+    store.close()
     return records / seconds, records / robot.chunks, stored
 
 

@@ -3,20 +3,21 @@
     python benchmarks/ledger_faults.py [--chain anvil|clique] [--seeds A:B] [--seconds S] [--out FILE]
 
 Each seed is a run of its own: a real node (anvil with a block a second or two a second, or a geth that signs blocks
-by Clique, named by GETH), the contract, an inbox, the submitter as a process, and two robots that seal chunks, send
-them to the inbox as the server's workers do, and again what they do not know to be confirmed. For `seconds` the
-faults that the seed draws come in between:
+by Clique, named by GETH), the contract, a store, the submitter as a process, and two robots that seal chunks and send
+what follows the head that the store says, from what they were not told to be confirmed. For `seconds` the faults that
+the seed draws come in between:
 
     kill        the submitter is killed (-9) and started again         rival      a second submitter, by mistake
     drop        a transaction in the pool is lost                       empty      all of them are
     foreign     the robot's key is used elsewhere                       spike      the price of gas rises
     reorg       the newest blocks are replaced, below N                 deep       and beyond N
     limit       the node answers 429 to most requests                   cut        its answers are lost
-    lost        the inbox is deleted                                    old        an old copy of it is put back
+    lost        the store is deleted, or                                old        an old copy of it is put back,
+                while the submitter is stopped or while it runs
 
 Then it is left alone until all is written, and the chain is read. `missing` counts chunks that were sealed and are
 not there, `doubled` those that are there twice, `disorder` those out of the log's order; all have to be 0. A seed has
-either deep reorganisations or lost inboxes: with both, what the robot was told to be confirmed is nowhere.
+either deep reorganisations or lost stores: with both, what the robot was told to be confirmed is nowhere.
 `reverted` counts transactions that were in a block for nothing. One line of JSON for each seed.
 """
 
@@ -46,13 +47,13 @@ import requests
 
 import geth_network
 from ports import free_port
-from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.inbox import Inbox
-from rosbridge_eth.inbox.sqlite import SqliteInbox
+from rosbridge_eth.errors import BridgeError, StoreError
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import Fees
 from rosbridge_eth.ledger.nodes import Anvil
-from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal, stream_name
+from rosbridge_eth.log.sqlite import SqliteStore
+from rosbridge_eth.log.store import Offer, Store, place_of
 from rosbridge_eth.server import submitter
 from smcrypto import sm2
 
@@ -199,42 +200,46 @@ class Proxy:
 
 
 class Robot:
-    """Seals chunks; offers them to the inbox; keeps what it was not told to be confirmed."""
+    """Seals chunks; sends what follows the store's head; keeps on its disk what it was not told to be confirmed."""
 
     def __init__(self, number: int, ledger: bytes, dice: random.Random) -> None:
         self.account, self.tk = KEYS.robot(number), robot_id(f"robot_{number}")
         self._log, self._dice = Log(ledger, self.tk), dice
         self.written: list[Chunk] = []
-        self.told = 0  # how many chunks it was told to be confirmed
-        self._previous, self._stream, self._number = bytes(32), dice.randbytes(16), 0
+        self.disk: list[Chunk] = []
+        self._previous, self._stream, self._number = bytes(32), bytes(16), 0
+        self._begin()
+
+    def _begin(self) -> None:
+        wall = int(time.time() * 1000) - self._dice.choice([0, 0, 3_600_000])  # a clock that is put back
+        self._stream, self._number = stream_name(wall, self._stream, self._dice.randbytes), 0
 
     def seal(self) -> None:
         if self._dice.random() < 0.1:
-            self._stream, self._number = self._dice.randbytes(16), 0
+            self._begin()
             self._previous = self._previous if self._dice.random() < 0.8 else bytes(32)
         lines = [b"x" * self._dice.choice([100, 8_000, 30_000])] if self._dice.random() < 0.7 else []
         chunk = seal(self._log, SIGNER, lines, stream=self._stream, number=self._number, previous=self._previous,
                      sealed_ms=int(time.time() * 1000), readers=[READER.public_key], compress=False)  # fmt: skip
         self._previous, self._number = chunk.header.digest, self._number + 1
         self.written.append(chunk)
+        self.disk.append(chunk)
 
-    def offer(self, inbox: Inbox, since: int | None = None) -> None:
-        since = self.told if since is None else since
-        inbox.append([(self.tk, chunk) for chunk in self.written[since:]], time.time())
-
-    def listen(self, inbox: Inbox) -> None:
-        places = [(chunk.header.stream, chunk.header.number) for chunk in self.written]
-        confirmed = inbox.state(self.tk).confirmed
-        if confirmed in places:
-            self.told = max(self.told, places.index(confirmed) + 1)
+    def talk(self, store: Store) -> None:
+        """A dozen chunks at most."""
+        [state] = store.states([self.tk])
+        self.disk = [chunk for chunk in self.disk if place_of(chunk.header) > state.confirmed]
+        rest = [chunk for chunk in self.disk if place_of(chunk.header) > state.head][:12]
+        before = [state.digest, *(chunk.header.digest for chunk in rest)]
+        store.append([Offer(self.tk, *each) for each in zip(rest, before, strict=False)], time.time())
 
 
-def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
+def submit(url: str, contract: str, path: str, ledger: str) -> None:
     """The child: a submitter, until it is killed."""
     submitter.PATIENCE = PATIENCE  # the runs are short
     submitter.LONGEST_PAUSE = 2.0
     keys = {robot_id(f"robot_{n}"): KEYS.robot(n) for n in range(1, ROBOTS + 1)}
-    store = SqliteInbox(Path(inbox), bytes.fromhex(ledger), 10**9, 10**8)
+    store = SqliteStore(Path(path), bytes.fromhex(ledger), 10**9, 10**8)
     writer = submitter.Submitter(
         Ledger(url, contract, timeout=5), store, keys.keys, keys.get, KEYS.operator,
         submitter.Settings(confirmations=CONFIRMATIONS, gas_per_day=10**12),
@@ -243,7 +248,7 @@ def submit(url: str, contract: str, inbox: str, ledger: str) -> None:
     while True:
         try:
             time.sleep(writer.turn(time.time()))
-            holds = [store.state(tk).hold for tk in keys]
+            holds = [state.hold for state in store.states(list(keys))]
             if said != (said := (writer.trouble, writer.funds, writer.unconfirmed, *holds)):
                 print(f"{time.time():.1f}", *said, dict(writer.counts), sep=" | ", file=sys.stderr, flush=True)
         except BridgeError as error:
@@ -265,18 +270,18 @@ class World:
         self.node.floor = self.ledger.block_number()
         self.proxy = Proxy(self.node.url)
         stack.callback(self.proxy.close)
-        self.folder, self.inboxes = folder, 0
+        self.folder, self.stores = folder, 0
         self.copy: Path | None = None
         self.processes: list[subprocess.Popen[bytes]] = []
         stack.callback(self.stop)
         self.counts: Counter[str] = Counter()
-        self.new_inbox()
+        self.new_store()
         self.start()
 
-    def new_inbox(self, path: Path | None = None) -> None:
-        self.inboxes += 1
-        self.path = path or self.folder / f"inbox-{self.inboxes}"
-        self.inbox = SqliteInbox(self.path, self.ledger.ledger, 10**9, 10**8)
+    def new_store(self, path: Path | None = None) -> None:
+        self.stores += 1
+        self.path = path or self.folder / f"store-{self.stores}"
+        self.store = SqliteStore(self.path, self.ledger.ledger, 10**9, 10**8)
 
     def start(self) -> None:
         command = [sys.executable, __file__, "--submit", self.proxy.url, self.ledger.contract, str(self.path),
@@ -330,36 +335,34 @@ class World:
         self.proxy.cut = not self.proxy.cut
 
     def lost(self) -> None:
+        if self.dice.random() < 0.5:  # under those who use it
+            for suffix in ("", "-wal", "-shm"):
+                Path(f"{self.path}{suffix}").unlink(missing_ok=True)
+            return
         self.stop()
-        self.listen()
-        self.new_inbox()
+        self.new_store()
         if self.dice.random() < 0.5:
-            self.offer()
+            self.talk()
         self.start()
-        self.offer()
 
     def old(self) -> None:
         if self.copy is None:
-            self.copy = self.folder / f"copy-{self.inboxes}"
-            with closing(sqlite3.connect(self.path)) as source, closing(sqlite3.connect(self.copy)) as copy:
-                source.backup(copy)
+            self.copy = self.folder / f"copy-{self.stores}"
+            _copy(self.path, self.copy)
             return
-        self.stop()
-        self.listen()
-        self.new_inbox(self.copy)
+        if self.dice.random() < 0.5:
+            _copy(self.copy, self.path)  # under those who use it
+        else:
+            self.stop()
+            self.new_store(self.copy)
+            self.start()
         self.copy = None
-        self.start()
-        self.offer()
 
     # ---- the run
 
-    def listen(self) -> None:
+    def talk(self) -> None:
         for robot in self.robots:
-            robot.listen(self.inbox)
-
-    def offer(self) -> None:
-        for robot in self.robots:
-            robot.offer(self.inbox)
+            robot.talk(self.store)
 
     def rage(self, seconds: float) -> None:
         faults = ["kill", "kill", "rival", "drop", "drop", "empty", "foreign", "spike", "reorg", "reorg", "limit"]
@@ -370,8 +373,8 @@ class World:
             for robot in self.robots:
                 for _ in range(self.dice.choice([0, 0, 1, 1, 3, 9])):
                     robot.seal()
-                robot.offer(self.inbox, max(robot.told, len(robot.written) - 12))
-            self.listen()
+                with suppress(StoreError):
+                    robot.talk(self.store)
             if self.dice.random() < 0.6:
                 fault = self.dice.choice(faults)
                 try:
@@ -385,11 +388,10 @@ class World:
         """Left alone; seconds until all is confirmed."""
         self.proxy.limit, self.proxy.cut = 0, False
         self.kill()
-        self.offer()
         began = time.monotonic()
         while time.monotonic() < began + SETTLE:
-            self.listen()
-            if all(robot.told == len(robot.written) for robot in self.robots):
+            self.talk()
+            if not any(robot.disk for robot in self.robots):
                 break
             time.sleep(0.3)
         return time.monotonic() - began
@@ -407,7 +409,7 @@ class World:
             found["doubled"] += sum(count - 1 for count in counted.values())
             found["strange"] += sum(digest not in place for digest in counted)
             found["disorder"] += sum(place.get(a, 0) >= place.get(b, 0) for a, b in pairwise(chain))
-            found["unconfirmed"] += len(robot.written) - robot.told
+            found["unconfirmed"] += len(robot.disk)
         for number in range(1, head + 1):
             for hash in self.node.ask("eth_getBlockByNumber", hex(number), False)["transactions"]:
                 receipt = self.node.ask("eth_getTransactionReceipt", hash)
@@ -417,6 +419,12 @@ class World:
                     found[kind] += 1
                     found["reverted"] += kind == "transactions" and receipt["status"] != "0x1"
         return dict(found)
+
+
+def _copy(source: Path, target: Path) -> None:
+    """SQLite's online backup, which is also its restore where somebody uses the target."""
+    with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
+        one.backup(other)
 
 
 @contextmanager

@@ -45,9 +45,10 @@ import load
 import paper_page
 import scale
 from rosbridge_eth.log.chunk import Chunk, robot_id
+from rosbridge_eth.log.store import Offer
 from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server.shard import open_store, open_submitter
 from rosbridge_eth.server.submitter import Submitter
-from rosbridge_eth.server.supervisor import open_store, open_submitter
 
 PER_BUCKET = 100  # messages that share a point of the picture
 CONFIRMATIONS = {"poa": 3, "pow": 12}
@@ -199,14 +200,14 @@ def reorganisation(dag: Path) -> Part:
         def stands(chunks: int) -> bool:
             return written() == chunks
 
-        inbox.append([(tk, chunk) for chunk in chunks[:5]], time.time())
+        inbox.append([Offer(tk, chunk) for chunk in chunks[:5]], time.time())
         turn_until(submitter, partial(stands, 5))
         say("the miners are cut from each other")
         network.cut_off(ours)
         fork = ours.height()
         other.request("miner_start", 2)
         for given in (10, 15):  # two batches, in blocks that will be lost
-            inbox.append([(tk, chunk) for chunk in chunks[given - 5 : given]], time.time())
+            inbox.append([Offer(tk, chunk) for chunk in chunks[given - 5 : given]], time.time())
             turn_until(submitter, partial(stands, given))
         turn_until(submitter, lambda: ours.height() >= fork + DEPTH)
         ours.request("miner_stop")
@@ -220,7 +221,7 @@ def reorganisation(dag: Path) -> Part:
             time.sleep(0.5)
         after = written()
         say(f"the chain turned: {after} chunks are left")
-        inbox.append([(tk, chunk) for chunk in chunks[15:]], time.time())
+        inbox.append([Offer(tk, chunk) for chunk in chunks[15:]], time.time())
         ours.request("miner_start", 1)
         turn_until(submitter, partial(stands, len(chunks)))
         found = load.read_back(operator, operator.ledger, robot)

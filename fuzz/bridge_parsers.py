@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 from rosbridge_eth.log import chunk as chunks
 from rosbridge_eth.log.chunk import Chunk, ChunkError, Header
-from rosbridge_eth.protocol import ProtocolError, decode_down, decode_up, encode
+from rosbridge_eth.log.hop import HopError, ServerState, decode_offer, encode_offer
 from smcrypto import sm2
 
 _LOG = chunks.Log(b"l" * 32, b"t" * 32)
@@ -55,15 +55,15 @@ def _plaintext(data: bytes) -> None:
     _require(sum(map(len, lines)) < chunks.MAX_PLAINTEXT and not any(b"\n" in line for line in lines), "lines")
 
 
-def _up(data: bytes) -> None:
-    _require(encode(decode_up(data)) == data, "a robot's message")
+def _offer(data: bytes) -> None:
+    _require(encode_offer(*decode_offer(data)) == data, "a robot's offer")
 
 
-def _down(data: bytes) -> None:
-    _require(encode(decode_down(data)) == data, "a server's message")
+def _state(data: bytes) -> None:
+    _require(ServerState.decode(data).encode() == data, "a server's state")
 
 
-READERS: tuple[Callable[[bytes], None], ...] = (_header, _chunk, _plaintext, _up, _down)
+READERS: tuple[Callable[[bytes], None], ...] = (_header, _chunk, _plaintext, _offer, _state)
 
 
 def check(data: bytes) -> None:
@@ -72,7 +72,7 @@ def check(data: bytes) -> None:
         return
     try:
         READERS[data[0] % len(READERS)](data[1:])
-    except (ChunkError, ProtocolError):
+    except (ChunkError, HopError):
         return
 
 

@@ -14,12 +14,13 @@ import rosbridge_eth
 from rosbridge_eth import identity as ids
 from rosbridge_eth.config.home import BridgeEnd, RobotHome
 from rosbridge_eth.log.chunk import Chunk, Log, NoGrant, content_key, drop, open_lines, robot_id
+from rosbridge_eth.log.store import NOWHERE
 from rosbridge_eth.operator.bundle import Bundle, ask_to_join, join
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 from smcrypto import sm2
 
 PASSWORD = b"robot's"
-END = BridgeEnd("robot_1", "server", "127.0.0.1:9", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+END = BridgeEnd("robot_1", "server", ["127.0.0.1:9"], 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 LOG = Log(END.ledger, robot_id(END.robot))
 NOW = datetime.now(UTC)
 CA = ids.create_ca("CA", at=NOW)
@@ -52,10 +53,7 @@ def environment(**more: str) -> dict[str, str]:
 def chunks_of(home: RobotHome) -> Iterator[Chunk]:
     """What stands in its spool, the oldest first."""
     spool = Spool(home.spool, LOG, max_bytes=1 << 30, drop=partial(drop, LOG, READER.signing_key))
-    place = spool.next_stream(b"")
-    while place is not None:
-        yield from spool.following(place[0], None, 1 << 30)
-        place = spool.next_stream(place[0])
+    yield from [Chunk.parse(chunk) for row in spool.rows(NOWHERE, 100_000) for chunk in spool.chunks([row.place])]
     spool.close()
 
 

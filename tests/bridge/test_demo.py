@@ -79,7 +79,7 @@ def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatc
 
     def stop_early(robot: Robot) -> None:
         # Without a session it would stop with everything in its spool, as it should.
-        if robot.captured >= 100 and robot.sender.statistics.connected:
+        if robot.captured >= 100 and robot.sender.connected:
             robot.stop()  # at the end once more, as a signal may come when all is done
 
     for attempt in range(5):  # a machine that is busy may capture the whole bag before there is a session

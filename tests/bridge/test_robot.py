@@ -16,17 +16,18 @@ import pytest
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
-from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
 from rosbridge_eth.log.database import DiskFull
+from rosbridge_eth.log.hop import ServerState, decode_offer
+from rosbridge_eth.log.store import NOWHERE, place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.protocol import Confirmed, Stored, Where, encode
 from rosbridge_eth.robot.loop import MAX_UNSPOOLED, RING, Robot
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 
 TOPIC = "/robot_1/odom"
 PLACE = Log(bytes(32), robot_id("robot_1"))
@@ -59,7 +60,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
     """Robots with nobody at the other end."""
     ca = ids.create_ca("operator", at=NOW)
     who = ids.enrol(ca, ids.Role.ROBOT, "robot_1", at=NOW)
-    [nobody] = server_sockets(("127.0.0.1", 0))
+    nobody = server_socket(("127.0.0.1", 0))
 
     def made(count: int) -> Robot:
         now = time.monotonic()
@@ -68,8 +69,8 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
         writer = LogWriter(PLACE, who.signing_key, [who.encryption_key.public_key], previous=bytes(32),
                            stream_line=stream_line("bag", "test"), period=0.001, now=now)
         return Robot(source=Source(count), capture=Capture([TopicRule(TOPIC)], source_kind="bag"), writer=writer,
-                     spool=spool, client=client, sender=Sender(client, spool),
-                     server=Address(*nobody.getsockname()[:2]))
+                     spool=spool, client=client, sender=Sender(client, spool, writer),
+                     servers=[Address(*nobody.getsockname()[:2])])
 
     yield made
     nobody.close()
@@ -125,8 +126,7 @@ def test_a_spool_that_cannot_be_read_does_not_end_a_robot(
         if turns == 3:
             monkeypatch.setattr(robot.spool, "statistics", away)
             monkeypatch.setattr(robot.sender, "send", away)
-            monkeypatch.setattr(robot.sender, "handle", away)
-            robot.handle(Message(b"", b"", robot.client))  # type: ignore[arg-type]
+            monkeypatch.setattr(type(robot.sender), "idle", property(away))
         if turns == 10:
             robot.stop()
 
@@ -141,7 +141,7 @@ def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_
 ) -> None:
     robot, sends, away = make(3000), list[bool](), [True]
 
-    def send() -> None:
+    def send(now: float) -> None:
         sends.append(away[0])
         if away[0]:
             raise StoreError("a page of it cannot be read")
@@ -162,7 +162,7 @@ def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_
     assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: well again"]
 
 
-def test_an_answer_that_the_spool_could_not_note_is_asked_for_again(
+def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, sent = make(10), list[bytes]()
@@ -172,23 +172,26 @@ def test_an_answer_that_the_spool_could_not_note_is_asked_for_again(
         monkeypatch.setattr(robot.client, "send", sent.append)
         [chunk] = robot.writer.finish(0)
         spool.append(chunk)
-        place = chunk.header.stream, chunk.header.number, chunk.header.digest
-        sender.statistics.connected = True
-        sender.send()
-        assert sent == [encode(Where(*place))]
-        lost, full = spool.lost, DiskFull("the disk is full; make room")
+        robot.handle(Message(b"", ServerState().encode(), robot.client))  # type: ignore[arg-type]
+        robot._send(0.0)
+        assert [decode_offer(offer) for offer in sent] == [(chunk.encoded, b"")]
+        here = place_of(chunk.header)
+        said = ServerState(here, chunk.header.digest, here, 7).encode()
+        confirmed, full = spool.confirmed, DiskFull("the disk is full; make room")
 
-        def fails(*given: object) -> None:
+        def fails(*given: object) -> int:
             raise full
 
-        monkeypatch.setattr(spool, "lost", fails)
-        robot.handle(Message(b"", encode(Stored(*place)), robot.client))  # type: ignore[arg-type]
-        assert robot.spool_trouble.why == str(full) and not sender.idle
-        monkeypatch.setattr(spool, "lost", lost)
-        sender.send()
-        assert sent[1:] == sent[:1], "it asks again"
-        robot.handle(Message(b"", encode(Stored(*place)), robot.client))  # type: ignore[arg-type]
-        assert robot.spool_trouble.why is None and sender.idle
+        monkeypatch.setattr(spool, "confirmed", fails)
+        robot.handle(Message(b"", said, robot.client))  # type: ignore[arg-type]
+        robot._send(1.0)
+        assert robot.spool_trouble.why == str(full) and len(spool.rows(NOWHERE, 9)) == 1
+        monkeypatch.setattr(spool, "confirmed", confirmed)
+        robot._send(1.5)
+        assert robot.spool_trouble.why == str(full), "a second has to pass"
+        robot._send(2.0)
+        assert robot.spool_trouble.why is None and sender.idle and spool.rows(NOWHERE, 9) == []
+        assert len(sent) == 1 and (sender.confirmed, sender.block) == (1, 7)
 
 
 def test_a_time_at_which_the_server_s_own_certificates_do_not_hold_is_not_kept(make: Callable[[int], Robot]) -> None:
@@ -259,17 +262,6 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
     robot.run(on_turn=on_turn)
     assert waiting[-1] <= 4
     assert re.search(r"[1-9]\d+ messages lost, since the spool took nothing", robot.summary), "what the ring held"
-
-
-def test_what_an_earlier_run_dropped_is_not_told_of_this_one(make: Callable[[int], Robot]) -> None:
-    first = make(0)
-    with closing(first.loop), closing(first.spool):
-        for chunk in first.writer.finish(0):
-            first.spool.append(chunk)
-        first.spool._db.run("UPDATE spool SET dropped_bodies = 7")
-    robot = make(10)
-    robot.run(on_turn=lambda: robot.stop() if robot.captured == 10 else None)
-    assert "dropped" not in robot.summary
 
 
 def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
@@ -356,6 +348,7 @@ def test_what_is_confirmed_of_a_topic_is_what_chunks_up_to_that_place_hold(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, marks: int
 ) -> None:
     monkeypatch.setattr("rosbridge_eth.robot.loop.MARKS", marks)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.GATHER", 0.0)
     robot = make(300)
     emit = robot._emit
 
@@ -366,16 +359,14 @@ def test_what_is_confirmed_of_a_topic_is_what_chunks_up_to_that_place_hold(
     monkeypatch.setattr(robot, "_emit", slowly)
     monkeypatch.setattr(robot.spool, "close", lambda: None)
     robot.run(on_turn=lambda: robot.stop() if robot.captured == 300 else None)
-    chunks = [*robot.spool.following(robot.writer.stream, None, 1 << 30)]
+    chunks = [Chunk.parse(robot.spool.chunks([row.place])[0]) for row in robot.spool.rows(NOWHERE, 10_000)]
     assert robot.writer.sealed[TOPIC] == robot.written[TOPIC] == 300 and len(chunks) > 20
     lines, shown = -2, []  # the line that opens the stream, and that of the type
     for chunk in chunks:
         lines += chunk.header.records
-        robot.sender.statistics.newest = Confirmed(chunk.header.stream, chunk.header.number, 7)
+        robot.sender.newest = place_of(chunk.header)
         assert robot.confirmed()[TOPIC] <= max(0, lines)
         shown.append(robot.confirmed()[TOPIC] == max(0, lines))
     assert shown[-1] and robot.confirmed()[TOPIC] == 300 and len(robot._marks) == 0
     assert all(shown) == (marks == 512)
-    robot.sender.statistics.newest = Confirmed(bytes(16), 9999, 8)
-    assert robot.confirmed()[TOPIC] == 300, "of an earlier run"
     Spool.close(robot.spool)

@@ -48,7 +48,7 @@ def run_time_nodes(tree: ast.AST) -> Iterator[ast.AST]:
 
 def imports_of(package: Path) -> dict[str, set[str]]:
     """Of each module, the modules of the package that it names, also within functions."""
-    files = {module_of(path, package): path for path in package.rglob("*.py") if path.parent.name != "inbox"}
+    files = {module_of(path, package): path for path in package.rglob("*.py")}
     found: dict[str, set[str]] = {}
     for module, path in files.items():
         named = set[str]()

@@ -1,6 +1,6 @@
 """A robot is replaced or revoked while the server still has chunks of it; what a reader of the chain finds afterwards.
 
-The real administration, inbox, submitter and contract on the embedded chain, and robots that sign with the keys that
+The real administration, store, submitter and contract on the embedded chain, and robots that sign with the keys that
 they made; tests/bridge/home/test_administration.py has the steps one by one.
 """
 
@@ -19,13 +19,13 @@ from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import Identity, Role, Trust, load_identity
-from rosbridge_eth.inbox import Outcome
 from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.store import Offer, Outcome
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.operator.bundle import join, read_bundle
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import Kind, Verdict, read_robot
-from rosbridge_eth.server.supervisor import open_submitter
+from rosbridge_eth.server.shard import open_submitter
 
 SERVED = 3.0  # seconds of the server's, for what it has to be written and confirmed
 
@@ -39,7 +39,7 @@ class Town(World):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.submitter = open_submitter(
-            load_server_config(self.home.config), self.ledger, self.open_inbox(), Registry(self.home.registry),
+            load_server_config(self.home.config), self.ledger, self.open_store(), Registry(self.home.registry),
             self.keys,
         )  # fmt: skip
         self.on_pause: Callable[[], None] = lambda: None
@@ -73,7 +73,7 @@ class Town(World):
 
     def lost(self) -> list[tuple[str, bytes]]:
         """Dead letters: why, and which chunk."""
-        return [(letter.why, letter.chunk) for letter in self.inbox.dead()]
+        return [(letter.why, letter.chunk) for letter in self.store.dead()]
 
 
 @dataclass
@@ -97,7 +97,9 @@ class Robot:
             self.writer.add(b'{"lost":1,"topic":"/t","why":"%s"}' % line.encode(), 0.0)
             chunks += self.writer.closed(10.0, int(time.time() * 1000))
         assert len(chunks) == len(lines)
-        outcomes = self.town.inbox.append([(TK, chunk) for chunk in chunks], self.town.now)
+        [state] = self.town.store.states([TK])
+        offers = [Offer(TK, chunk, b"" if chunk.header.number else state.digest) for chunk in chunks]
+        outcomes = self.town.store.append(offers, self.town.now)
         assert set(outcomes) == {Outcome.STORED}
         return chunks
 
@@ -199,7 +201,7 @@ def test_what_is_not_written_in_time_becomes_dead_letters_and_is_never_written(t
     assert town.written() == []
     [standing] = town.ledger.standings([TK])
     assert standing.revoked and standing.chunks == 0
-    assert town.inbox.totals()[TK].chunks == 0
+    assert town.store.waiting(TK).chunks == 0
 
 
 def test_the_new_robot_of_a_name_is_not_held_up_by_the_old_ones_dead_letters(town: Town) -> None:
@@ -211,4 +213,4 @@ def test_the_new_robot_of_a_name_is_not_held_up_by_the_old_ones_dead_letters(tow
     new.says("c")
     town.serve()
     assert town.written() == [(new.account, 1)]
-    assert town.inbox.state(TK).hold is None
+    assert town.store.states([TK])[0].hold == ""

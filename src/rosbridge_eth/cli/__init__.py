@@ -1,4 +1,4 @@
-"""The command line: parses, calls, prints. Data goes to stdout, talk to stderr.
+"""The command line: parses, calls, prints. Data goes to stdout, messages to stderr.
 
 Exit codes are those of rosbridge_eth.errors.ExitCode; a failure a person can act on is one sentence on stderr and
 never a traceback.
@@ -87,7 +87,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if stop.code == INTERRUPTED:
             talk("rosbridge-eth: interrupted")
         return stop.code if isinstance(stop.code, int) else int(ExitCode.OK)
-    except BrokenPipeError:  # `read | head`: whoever took the data has enough
+    except BrokenPipeError:  # `read | head`: the reader of stdout has ended
         return int(ExitCode.FAILED)
     except OSError as error:  # a file or folder given by the user that cannot be read or written, a full disk
         named = " and ".join(str(name) for name in (error.filename, error.filename2) if name is not None)

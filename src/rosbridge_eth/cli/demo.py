@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 from rich.table import Table
 
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from rosbridge_eth.cli.relay import Harm
     from rosbridge_eth.reading.compare import Comparison
     from rosbridge_eth.robot.loop import Robot
-    from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.submitter import Submitter
+    from rosbridge_eth.server.shard import Shard
 
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
@@ -104,27 +103,17 @@ class DemoResult:
 
 
 @contextmanager
-def _serving(worker: Worker, submitter: Submitter) -> Iterator[Callable[[], None]]:
-    """The server's parts, in two threads; gives what raises their failure in this one."""
+def _serving(shard: Shard) -> Iterator[Callable[[], None]]:
+    """The server, in threads; gives what raises its failure in this one."""
     stop = threading.Event()
-
-    def submit() -> None:
-        while not stop.wait(min(0.05, submitter.turn(time.time()))):
-            continue
-
-    def check() -> None:
-        for task in tasks:
-            if task.done():
-                task.result()
-
-    with ThreadPoolExecutor(2) as threads:
-        tasks = [threads.submit(worker.run, stop.is_set), threads.submit(submit)]
+    with ThreadPoolExecutor(1) as threads:
+        task = threads.submit(shard.run, stop.is_set)
         try:
-            yield check
+            yield lambda: task.result() if task.done() else None
         finally:
             stop.set()
-            worker.loop.wake()
-    check()
+            shard.worker.loop.wake()
+    task.result()
 
 
 def run_demo(
@@ -144,7 +133,7 @@ def run_demo(
     from rosbridge_eth.reading.compare import compare
     from rosbridge_eth.robot.loop import open_robot
     from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
+    from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
 
     started, stages = time.monotonic(), Stages()
     home, robot_home, reader_home = (
@@ -175,22 +164,22 @@ def run_demo(
     with stage("registration"):
         made = administration.register_robot(
             home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
-            inbox=lambda: open_store(config, home), request=Request.decode(robot_home.request.read_bytes()),
+            inbox=lambda: open_store(config, home, 0), request=Request.decode(robot_home.request.read_bytes()),
         )
         join(robot_home, read_bundle(made.bundle.read_bytes()))
 
-    [sock] = server_sockets(config.listen)
-    inbox, identity = open_store(config, home), administration.load_server_identity(home, passphrase)
-    reception = open_reception(0, config, identity, home, registry, inbox, deployment)
-    worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
-    submitter = open_submitter(config, ledger, open_store(config, home), registry, keys)
+    sock = server_socket(config.listen)
+    inbox, identity = open_store(config, home, 0), administration.load_server_identity(home, passphrase)
+    reception = open_reception(config, identity, home, registry, inbox)
+    submitter = open_submitter(config, ledger, open_store(config, home, 0), registry, keys)
+    shard = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
     with closing(Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)) as relay:
         # Short chunks, so that there are several.
         more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
         robot_home.config.write_text(f'server = "127.0.0.1:{relay.port}"\n{robot_toml(topics, str(bag))}{more}')
         robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
 
-        with _serving(worker, submitter) as check:
+        with _serving(shard) as check:
 
             def progress() -> None:
                 check()
@@ -204,7 +193,7 @@ def run_demo(
             progress()
             with stage("last batches"):
                 deadline = time.monotonic() + SETTLE
-                while any(waiting.chunks for waiting in inbox.totals().values()):
+                while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
                     check()
                     if time.monotonic() > deadline:
                         raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -24,13 +24,10 @@ from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.config.values import Address, counted, parse_address, parse_time
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
-from rosbridge_eth.identity import Identity, Role, Trust, load_identity, public_identity, read_certificates
+from rosbridge_eth.identity import Role, Trust, load_identity, public_identity, read_certificates
 from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading, Verdict, read_robot
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
-
-if TYPE_CHECKING:
-    from rosbridge_eth.ledger import Ledger
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -124,25 +121,20 @@ def read(
         raise typer.BadParameter(f"only an .mcap file can be read while it grows, not {bag}", param_hint="--bag")
     if len(robot) > 1 and (address is None or bag or table or plot):
         raise typer.BadParameter("a file has one robot's records; several are for --serve", param_hint="ROBOT")
-    place = ReaderHome(home).require()
     for path, check in ((bag, outputs.check_bag), (table, outputs.check_table), (plot, outputs.check_picture)):
         if path is not None:
             check(path)
     picture = outputs.Curves(field) if field else outputs.Trajectory()
     chosen = dict.fromkeys(robot, 0)
-    with ExitStack() as stack:
+    with closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader, ExitStack() as stack:
         files = ExitStack()  # which is left first: what it holds is whole before the verdict is said
         turns: list[Callable[[], object]] = [sys.stdout.flush]
         records: Iterator[tuple[str, ProvenRecord]]
         if follow:
-            records, said = stack.enter_context(
-                _following(place, robot, node, confirmations, confirm, passphrase_file, choice, address, turns)
-            )
+            records, said = stack.enter_context(_following(reader, robot, choice, address, turns))
         else:
             [name] = robot
-            reading, of_it = stack.enter_context(
-                _reading_of(place, name, node, confirmations, confirm, passphrase_file)
-            )
+            reading, of_it = stack.enter_context(reader.reading(name))
             records, said = ((name, record) for record in reading.records(choice)), {name: of_it}
         stack.enter_context(files)
         made = None if bag is None else files.enter_context(outputs.bag(bag, grows=follow))
@@ -169,7 +161,7 @@ def read(
     if not follow and not chosen[name]:
         _tell_topics(topic, reading)
     for name, of_it in said.items():
-        _require_sound(place, name, of_it)
+        reader.require_sound(name, of_it)
     if plot is not None and not picture.draw(plot):
         what = "a number there" if field else "a position"
         raise ConfigError(f"{plot} shows nothing: none of the {sum(chosen.values())} chosen records holds {what}")
@@ -191,9 +183,11 @@ def compare(
     """
     from rosbridge_eth.reading import compare as comparing
 
-    place = ReaderHome(home).require()
     choice = comparing.time_of(bag)
-    with _reading_of(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+    with (
+        closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
+        reader.reading(robot) as (reading, said),
+    ):
         made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
         said |= asdict(made)
     if json:
@@ -205,7 +199,7 @@ def compare(
     if made.absent:
         talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
     talk(f"equal to the bag's: {counted(made.equal, 'record')}; {counted(made.wrong, 'difference')}")
-    _require_sound(place, robot, said)
+    reader.require_sound(robot, said)
     if made.wrong or not made.equal:
         raise VerificationError(f"what the chain has of {robot} is not what {bag} holds; see above")
 
@@ -228,8 +222,10 @@ def evidence(
         raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
     if file.exists() or not file.parent.is_dir():
         raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
-    place = ReaderHome(home).require()
-    with _reading_of(place, robot, node, confirmations, confirm, passphrase_file) as (reading, said):
+    with (
+        closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
+        reader.reading(robot) as (reading, said),
+    ):
         records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
         for _ in reading.chunks:
             continue  # the verdict is on all of the log
@@ -240,7 +236,7 @@ def evidence(
     write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
     what = counted(len(made.records), "record")
     talk(f"{file}: {what}, for `verify {file} --ca ca.crt.pem`; who has it can read what it shows")
-    _require_sound(place, robot, said)
+    reader.require_sound(robot, said)
 
 
 def verify(
@@ -294,87 +290,79 @@ def grant(
     """
     from rosbridge_eth.reading import grant as granting
 
-    choice, place = _choice_of(None, from_, to, None), ReaderHome(home).require()
-    known = place.path / "readers" / f"{reader}.pem"
+    choice, known = _choice_of(None, from_, to, None), ReaderHome(home).require().path / "readers" / f"{reader}.pem"
     peer = public_identity(read_given(known if known.exists() else Path(reader)))
     now = datetime.now(UTC)
-    with _asking(place, node, confirmations, passphrase_file) as asked:
-        certificates = peer.signing_certificate.to_der(), peer.encryption_certificate.to_der()
-        peer = asked.trust.check(*certificates, role=Role.READER, at=now)
+    with closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as own:
+        peer = own.trust.check(*peer.pair, role=Role.READER, at=now)
         out = out or Path(f"{robot}-{peer.name}.grant")
         if out.exists():
             raise ConfigError(f"{out} is there already; name another with --out")
-        with _reading_as(asked, robot, confirm) as (reading, said):
+        with own.reading(robot) as (reading, said):
             keys = granting.keys_of(reading, choice)
         if not keys:
             raise ConfigError(f"this reader can open nothing of {robot} that was received in that time; see above")
         made = granting.make(
-            keys, ledger=reading.verifier.log.ledger, robot=robot, begin=from_, end=to, by=asked.identity, to=peer,
+            keys, ledger=reading.verifier.log.ledger, robot=robot, begin=from_, end=to, by=own.identity, to=peer,
             now=now,
         )  # fmt: skip
     write_atomically(out, made, new=True)
     talk(f"{out} opens {counted(len(keys), 'chunk')} of {robot} for reader {peer.name}, and for nobody else.")
     talk(f"Whoever has {peer.name}'s home puts it into `grants/` there and runs: rosbridge-eth read {robot}")
-    _require_sound(place, robot, said)
+    own.require_sound(robot, said)
 
 
 # What the commands share
 
 
-class _Asked(NamedTuple):
-    """Who reads, with what. read: `read_robot` that wants to know only whose log, when, and behind what."""
+class _Reader:
+    """Who reads, with what: made of a reader's home and the options that the commands share."""
 
-    identity: Identity
-    trust: Trust
-    ledgers: Sequence[Ledger]
-    bookmarks: Bookmarks
-    read: Callable[..., Reading]
+    def __init__(
+        self, home: Path, nodes: Sequence[str] | None, confirmations: int, confirm: bool, passphrase_file: Path | None
+    ) -> None:
+        from rosbridge_eth.ledger import Ledger
+        from rosbridge_eth.reading.grant import open_folder
 
+        self.home = ReaderHome(home).require()
+        config = load_reader_config(self.home.config)
+        passphrase = read_passphrase("reader", "Passphrase of the reader", file=passphrase_file)
+        self.identity, roots = load_identity(self.home.path, passphrase)
+        self.trust, self.confirmations, self.confirm = Trust(roots), confirmations, confirm
+        self.bookmarks = Bookmarks(self.home.path / "bookmarks.json")
+        self._granted = open_folder(self.home.grants, ledger=config.ledger, reader=self.identity, trust=self.trust)
+        self.ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
 
-@contextmanager
-def _asking(
-    place: ReaderHome, nodes: Sequence[str] | None, confirmations: int, file: Path | None
-) -> Iterator[_Asked]:
-    from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.reading.grant import open_folder
+    def close(self) -> None:
+        for ledger in self.ledgers:
+            ledger.close()
 
-    config = load_reader_config(place.config)
-    identity, roots = load_identity(place.path, read_passphrase("reader", "Passphrase of the reader", file=file))
-    trust = Trust(roots)
-    ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
-    bookmarks = Bookmarks(place.path / "bookmarks.json")
-    granted = open_folder(place.grants, ledger=config.ledger, reader=identity, trust=trust)
-
-    def read(robot: str, **more: Any) -> Reading:
+    def begin(self, robot: str, **more: Any) -> Reading:
+        """`read_robot` with all of this. more: at least `now`."""
         return read_robot(
-            ledgers, robot, trust=trust, reader=identity.encryption_key, bookmarks=bookmarks,
-            granted=granted.get(robot), memo=place.path / "proven", confirmations=confirmations, **more,
+            self.ledgers, robot, trust=self.trust, reader=self.identity.encryption_key, bookmarks=self.bookmarks,
+            granted=self._granted.get(robot), memo=self.home.path / "proven", confirmations=self.confirmations, **more,
         )  # fmt: skip
 
-    with ExitStack() as stack:
-        for ledger in ledgers:
-            stack.callback(ledger.close)
-        yield _Asked(identity, trust, ledgers, bookmarks, read)
+    @contextmanager
+    def reading(self, robot: str) -> Iterator[tuple[Reading, dict[str, Any]]]:
+        """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict is shown."""
+        said = dict[str, Any]()
+        with closing(self.begin(robot, now=time.time())) as reading:
+            yield reading, said
+            verdict = reading.verdict()
+        reading.keep(self.bookmarks, confirm=self.confirm)
+        said |= _say(verdict)
 
-
-@contextmanager
-def _reading_of(
-    place: ReaderHome, robot: str, nodes: Sequence[str] | None, confirmations: int,
-    confirm: bool, file: Path | None,
-) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    with _asking(place, nodes, confirmations, file) as asked, _reading_as(asked, robot, confirm) as found:
-        yield found
-
-
-@contextmanager
-def _reading_as(asked: _Asked, robot: str, confirm: bool) -> Iterator[tuple[Reading, dict[str, Any]]]:
-    """A reading, and where its verdict is when it has ended. Then the bookmark is kept and the verdict said, too."""
-    said = dict[str, Any]()
-    with closing(asked.read(robot, now=time.time())) as reading:
-        yield reading, said
-        verdict = reading.verdict()
-    reading.keep(asked.bookmarks, confirm=confirm)
-    said |= _say(verdict)
+    def require_sound(self, robot: str, said: dict[str, Any]) -> None:
+        if not said["sound"]:
+            raise VerificationError(
+                f"what the chain has of {robot} is not what the robot wrote; see the findings above"
+            )
+        if not said["records"] and "no-grant" in said["counts"]:
+            raise IdentityError(
+                f"nothing of {robot} is sealed for this reader; put {self.home.public} into its `readers/`"
+            )
 
 
 def _say(verdict: Verdict) -> dict[str, Any]:
@@ -386,8 +374,8 @@ def _say(verdict: Verdict) -> dict[str, Any]:
 
 @contextmanager
 def _following(
-    place: ReaderHome, robots: Sequence[str], nodes: Sequence[str] | None, confirmations: int,
-    confirm: bool, file: Path | None, choice: Choice, address: Address | None, turns: Sequence[Callable[[], object]],
+    reader: _Reader, robots: Sequence[str], choice: Choice, address: Address | None,
+    turns: Sequence[Callable[[], object]],
 ) -> Iterator[tuple[Iterator[tuple[str, ProvenRecord]], dict[str, dict[str, Any]]]]:  # fmt: skip
     """Records as they are proven, until SIGINT or SIGTERM; and where the verdicts are when that has ended.
 
@@ -397,10 +385,10 @@ def _following(
     from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 
     said, stop = dict[str, dict[str, Any]](), threading.Event()
-    with _asking(place, nodes, confirmations, file) as asked, ExitStack() as stack:
-        followed = [Followed(name, asked.read, asked.bookmarks, confirm=confirm) for name in robots]
-        following = Following(followed, asked.ledgers)
-        view = View([ledger.url for ledger in asked.ledgers], confirmations, robots)
+    followed = [Followed(name, reader.begin, reader.bookmarks, confirm=reader.confirm) for name in robots]
+    following = Following(followed, reader.ledgers)
+    view = View([ledger.url for ledger in reader.ledgers], reader.confirmations, robots)
+    with ExitStack() as stack:
         if address is not None:
             page = Page(address, view)
             stack.callback(page.close)
@@ -440,10 +428,3 @@ def _tell_topics(topic: str | None, reading: Reading) -> None:
     if topic is not None and topic not in reading.topics:
         there = ", ".join(shown(each) for each in sorted(reading.topics)[:20]) or "no topic"
         talk(f"nothing was read on {shown(topic)}; what was read is on: {there}")
-
-
-def _require_sound(place: ReaderHome, robot: str, said: dict[str, Any]) -> None:
-    if not said["sound"]:
-        raise VerificationError(f"what the chain has of {robot} is not what the robot wrote; see the findings above")
-    if not said["records"] and "no-grant" in said["counts"]:
-        raise IdentityError(f"nothing of {robot} is sealed for this reader; put {place.public} into its `readers/`")

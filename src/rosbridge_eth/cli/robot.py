@@ -26,6 +26,7 @@ from rosbridge_eth.config.models import BagConfig, SimConfig
 from rosbridge_eth.config.passphrases import read_passphrase, warn_if_others_read
 from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.identity import check_name
+from rosbridge_eth.log.chunk import STREAM_SIZE
 from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
 from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
@@ -156,7 +157,7 @@ def robot(
     """
     from rosbridge_eth.robot.loop import open_robot, read_again
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.supervisor import Beats, notify
+    from rosbridge_eth.server.parent import notify
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
@@ -171,7 +172,7 @@ def robot(
     again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
         running = open_robot(place, settings, password)  # a second robot gets no further: the spool is in use
-        stack.enter_context(metrics.shared(home))
+        stack.callback(metrics.file_of(home, "robot").unlink, missing_ok=True)
         _asked_for(place, running.box.triggers)  # when nobody was there to take it
 
         def on_signal(number: int, frame: FrameType | None) -> None:
@@ -184,12 +185,9 @@ def robot(
 
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
             signal.signal(number, on_signal)
-        if settings.monitor is not None:
-            web = metrics.Web(settings.monitor, ["robot"])
-            web.start()
-            stack.callback(web.stop)
-        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
-        beats, rates, told = Beats(), metrics.Rates(), not errors.is_terminal
+        stack.enter_context(metrics.served(settings.monitor))
+        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.addresses()[0]}; Ctrl-C ends it.")
+        beats, rates, told = metrics.Beats(1.0), metrics.Rates(), not errors.is_terminal
         show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
 
         def on_turn() -> None:
@@ -205,11 +203,13 @@ def robot(
                     notify("WATCHDOG=1")
                     for name in _asked_for(place, running.box.triggers):
                         running.fire("asked for", name)
-                    newest = running.sender.statistics.newest
-                    if not told and newest is not None and newest.stream == running.writer.stream:
+                    newest, block = running.sender.newest, running.sender.block
+                    if not told and running.writer.stream and newest[:STREAM_SIZE] == running.writer.stream:
                         told = True
-                        talk(f"The first record is in block {newest.block}{' or before' if newest.number else ''}.")
+                        before = " or before" if any(newest[STREAM_SIZE:]) else ""
+                        talk(f"The first record is in block {block}{before}.")
                     metrics.show_robot(end.robot, running, time.time())
+                    metrics.save(metrics.file_of(home, "robot"))
                 show()
 
         notify("READY=1")
@@ -227,10 +227,10 @@ def trigger(
 
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
-    try:
-        known = [labels["trigger"] for what, labels, _ in metrics.figures(home) if what == "trigger_fired"]
-    except ValueError:
-        raise nobody from None
+    figures = metrics.running(home).get("robot")
+    if figures is None:
+        raise nobody
+    known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]
     if not known or (name is not None and name not in known):
         raise ConfigError(f"the robot has no trigger{f' {name}' if name else ''}; it has: {', '.join(known) or 'none'}")
     wanted = known if name is None else [name]
@@ -262,17 +262,16 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
         f"Trigger {each.rule.name}: {len(each.ring)} records in memory, {each.ring.bytes / 2**20:.1f} of"
         f" {each.rule.memory / 2**20:.1f} MiB; events: {each.fired}." for each in running.box.triggers.values()
     ]
-    spool, sender = running.spool.statistics(), running.sender.statistics
+    spool, sender = running.spool.statistics(), running.sender
     written, sealed, confirmed = running.written, running.writer.sealed, running.confirmed()
     # Else some of what is below the newest confirmed place is not there.
-    known = not sender.refused and spool.dropped_bodies == running.dropped_before
+    known = not sender.refused and not spool.dropped_bodies
     rows = [
         (topic, f"{rates.of(topic, written[topic], now):.1f}", written[topic], sealed[topic],
          *((sealed[topic] - confirmed[topic], confirmed[topic]) if known else "??"), lost[topic])
         for topic in sorted({*written, *lost})
     ]  # fmt: skip
-    newest = sender.newest
-    where = f" (the last in block {newest.block})" if newest and newest.block else ""
+    where = f" (the last in block {sender.block})" if sender.block else ""
     session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
     columns = ["topic", "records/s", "records", "sealed", "waiting", "confirmed", "lost"]
     return Group(
@@ -280,7 +279,7 @@ def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
         *map(plain, kept),
         Text(
             f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
-            f" {spool.chunks - spool.unstored - spool.aside} for the chain, {sender.confirmed} confirmed{where}."
+            f" {spool.chunks - spool.unstored} for the chain, {sender.confirmed} confirmed{where}."
             f" Session: {one_line(session)}.",
             no_wrap=False, overflow="fold",  # why there is no session is longer than a line
         ),

@@ -52,8 +52,10 @@ class LogWriter:
         self._bytes = 0
         self.sealed = Counter[str]()
         """Lines that are in chunks, by the topic that `add` was told."""
-        self.stream = newest
-        """The newest stream known: the one that is written, or the one before until its first chunk is sealed."""
+        self.stream = b""
+        """The newest stream of which a chunk was sealed; empty before the first."""
+        self.newest = newest
+        """The newest stream that is known of this robot; the next one is named above it."""
         self.new_stream()
 
     def new_stream(self) -> None:
@@ -109,7 +111,7 @@ class LogWriter:
     def _seal_next(self, wall_ms: int, *, last: bool = False) -> list[Chunk]:
         """The next lines as a chunk, each behind what has to be said before it."""
         if not self._number:
-            self.stream = chunk.stream_name(wall_ms, self.stream, self._randomness)
+            self.stream = self.newest = chunk.stream_name(wall_ms, self.newest, self._randomness)
         lines = [] if self._number else [self._stream_line]
         size = sum(map(len, lines))
         while self._waiting and size < MAX_JSON:

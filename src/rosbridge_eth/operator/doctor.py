@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import http.client
-import json as jsonlib
 import os
 import socket
 import sqlite3
@@ -25,11 +24,10 @@ import typer
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
-from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
+from rosbridge_eth.config import Address, ServerConfig, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of, shard_of
 from rosbridge_eth.config.passphrases import passphrase_file, read_passphrase
-from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError
 from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
@@ -39,8 +37,8 @@ from rosbridge_eth.operator.status import ANSWER_TIME, span
 from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.robot.sender import mend
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.robot.topics import offered
-from rosbridge_eth.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 if TYPE_CHECKING:
@@ -151,6 +149,8 @@ def near(address: Address) -> Address:
 
 def monitor(address: Address | None, runs: bool) -> Findings:
     """Is the port of /metrics free, or does the process that should have it answer there?"""
+    from rosbridge_eth.server import metrics
+
     if address is None:
         return
     try:
@@ -159,15 +159,15 @@ def monitor(address: Address | None, runs: bool) -> Findings:
             yield ok("monitor", f"{address} is free")
             return
         with closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection:
-            connection.request("GET", "/readyz")
-            conditions = dict[str, bool](jsonlib.loads(connection.getresponse().read())["conditions"])
-        if not conditions:
+            connection.request("GET", "/metrics")
+            figures = metrics.parsed(connection.getresponse().read().decode())
+        if not any(name == "condition" for name, _, _ in figures):
             raise ValueError("no conditions")
-    except (OSError, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
+    except (OSError, http.client.HTTPException, ValueError, LookupError) as error:
         yield broken("monitor port", f"{address} is not answered by this home's process ({error})",
                      "stop what has the port, or correct `monitor`; then start again")
         return
-    if failing := [name for name, holds in conditions.items() if not holds]:
+    if failing := metrics.failing(figures):
         yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
     else:
         yield ok("monitor", f"{address} says ready")
@@ -215,18 +215,19 @@ def chain(ledger: Ledger) -> Findings:
 def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings:
     config = load_server_config(home.config)
     yield ok("configuration", str(home.config))
-    robots = str(config.address_for_robots())
+    robots = ", ".join(map(str, config.addresses()))
     for bundle in sorted(home.bundles.glob("*.bundle")):
         content = bundle.read_bytes()
         try:
-            told = robots if needs_password(content) else read_bundle(content).end.server_address
+            told = robots if needs_password(content) else ", ".join(read_bundle(content).end.servers)
         except IdentityError as error:
             yield note("bundle", f"{bundle}: {error}",
                        f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
             continue
         if told != robots:
-            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
-                       f'write server = "{robots}" into the robot.toml of who joined with it')
+            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and now the shards are at {robots}",
+                       f"nothing, if one of the old ones answers at {told}: it names the right one; else write"
+                       f' server = "{config.addresses()[0]}" into the robot.toml of who joined with it')
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -241,20 +242,25 @@ def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
 
 
 def door(home: OperatorHome, secret: bytes | None) -> Findings:
-    """The robots' UDP port is free, or a server answers there; the same of the monitor's."""
+    """Each shard's UDP port is free, or a server answers there; the same of the monitor's."""
     config = load_server_config(home.config)
+    for shard in range(config.shards):
+        yield from port(config, shard)
+
+
+def port(config: ServerConfig, shard: int) -> Findings:
+    listen = config.listen.next(shard)
     try:
-        for sock in server_sockets(config.listen):
-            sock.close()
+        server_socket(listen).close()
         runs = False
-        yield ok("UDP port", f"{config.listen} is free: the server does not run")
+        yield ok("UDP port", f"{listen} is free: shard {shard} does not run here")
     except NetworkError as error:
         if not isinstance(error.__cause__, OSError) or error.__cause__.errno != errno.EADDRINUSE:
             raise
         now = datetime.now(UTC)
         ca = ids.create_ca("doctor", at=now)  # who is not let in is refused, but by a server
         nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
-        place = near(config.listen)
+        place = near(listen)
         end, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
         runs = isinstance(end, HandshakeFailed) and end.hint is not None
         if runs:
@@ -262,7 +268,7 @@ def door(home: OperatorHome, secret: bytes | None) -> Findings:
         else:
             yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
                          f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
-    yield from monitor(config.monitor, runs)
+    yield from monitor(config.monitor and config.monitor.next(shard), runs)
 
 
 def registry(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -271,19 +277,18 @@ def registry(home: OperatorHome, secret: bytes | None) -> Findings:
 
 
 def store(home: OperatorHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.server.supervisor import open_store
+    from rosbridge_eth.server.shard import open_store
 
     if not home.deployment_file.exists():
         yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home.path}`")
         return
-    try:
-        inbox = open_store(load_server_config(home.config), home, read_only=True)
-    except NothingThere:
-        yield ok("store", "there is none yet; the server makes it")
-        return
-    with closing(inbox):
-        inbox.check()
-        yield ok("store", f"{sum(waiting.chunks for waiting in inbox.totals().values())} chunks wait")
+    config, waits, found = load_server_config(home.config), 0, "there is none yet; the server makes it"
+    for shard in range(config.shards):
+        with suppress(NothingThere), closing(open_store(config, home, shard, read_only=True)) as opened:
+            opened.check()
+            waits += sum(opened.waiting(tk).chunks for tk in opened.sizes() if shard_of(tk, config.shards) == shard)
+            found = f"{waits} chunks wait"
+    yield ok("store", found)
 
 
 def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -314,7 +319,7 @@ def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
 def bridge(home: RobotHome, secret: bytes | None) -> Findings:
     end, config = home.bridge(), load_robot_config(home.config)
     yield ok("configuration", str(home.config))
-    place = config.server or parse_address(end.server_address)
+    place = config.server or end.addresses()[0]
     if place.nowhere:
         yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
                      'write server = "HOST:PORT", as the server is reached, into robot.toml')
@@ -349,7 +354,7 @@ def source(home: RobotHome, secret: bytes | None) -> Findings:
 def session(home: RobotHome, secret: bytes | None) -> Findings:
     """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
     end, config, runs = home.bridge(), load_robot_config(home.config), False
-    log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
+    log, server = Log(end.ledger, robot_id(end.robot)), config.server or end.addresses()[0]
     try:
         Spool(home.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
         yield ok("spool", "opens")

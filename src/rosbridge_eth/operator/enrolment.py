@@ -1,7 +1,7 @@
 """What an operator does: make a home, deploy the contract, certify robots and readers, end their rights, look after
 the home.
 
-Functions on homes, a CA, a keyring, a Ledger and an Inbox; the command line asks for passphrases and prints. Every
+Functions on homes, a CA, a keyring, a Ledger and a Store; the command line asks for passphrases and prints. Every
 step that spans the registry, a file and the chain is ordered so that it can be run again after a crash between any two.
 """
 
@@ -26,11 +26,11 @@ from rosbridge_eth.config.values import parse_address
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.files import read_file, write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
-from rosbridge_eth.inbox import Inbox
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
 from rosbridge_eth.ledger.contract import BALANCE_LIMIT, WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.log.chunk import MAX_READERS, robot_id
+from rosbridge_eth.log.store import NOWHERE, Store
 from rosbridge_eth.operator.bundle import Bundle, Request
 from rosbridge_eth.operator.registry import OWNER, Registry
 from smcrypto import InvalidKey, sm2
@@ -317,7 +317,7 @@ class Registered(NamedTuple):
 
 def register_robot(
     home: OperatorHome, name: str, *, ca: CertificateAuthority, keys: Keyring, ledger: Ledger,
-    inbox: Callable[[], Inbox], now: datetime, request: Request | None = None, password: bytes | None = None,
+    inbox: Callable[[], Store], now: datetime, request: Request | None = None, password: bytes | None = None,
     replace: bool = False, compromised: bool = False, pause: Callable[[float], None] = time.sleep,
 ) -> Registered:  # fmt: skip
     """Bind a name to certificates and an account, on the chain and in the registry, and write the bundle.
@@ -338,7 +338,8 @@ def register_robot(
     if request and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
     there = home.deployment()
-    end = BridgeEnd(name, config.name, str(config.address_for_robots()), there.chain_id, there.genesis, there.contract)
+    servers = [str(address) for address in config.addresses()]
+    end = BridgeEnd(name, config.name, servers, there.chain_id, there.genesis, there.contract)
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:
@@ -408,22 +409,27 @@ def _register(
     )
 
 
-def _waiting(inbox: Callable[[], Inbox], tk: bytes, patience: float, pause: Callable[[float], None]) -> int:
+def _waiting(inbox: Callable[[], Store], tk: bytes, patience: float, pause: Callable[[float], None]) -> int:
     """Wait until the server closed the session of a robot out of force, and up to `patience` seconds until what it
     handed over is confirmed; how many chunks are not by then."""
     pause(HANDING_OVER)
     with closing(inbox()) as store:
-        while (left := store.waiting(tk, store.state(tk).position).chunks) and patience > 0:
+        while (left := store.waiting(tk).chunks) and patience > 0:
             pause(0.2)
             patience -= 0.2
     return left
 
 
-def _bury(inbox: Callable[[], Inbox], ledger: Ledger, tk: bytes, why: str) -> int:
+def _bury(inbox: Callable[[], Store], ledger: Ledger, tk: bytes, why: str) -> int:
     """What the chain does not have of this robot becomes dead letters; how many chunks."""
     [standing] = ledger.standings([tk])
+    buried = 0
     with closing(inbox()) as store:
-        return store.bury(tk, store.find(tk, standing.tail), why)
+        tail = store.find(tk, standing.tail) or NOWHERE
+        while rows := store.rows(tk, tail, 200):
+            store.remove(tk, [row.place for row in rows], why)
+            buried += len(rows)
+    return buried
 
 
 class Revoked(NamedTuple):
@@ -437,7 +443,7 @@ class Revoked(NamedTuple):
 
 
 def revoke(
-    home: OperatorHome, role: Role, name: str, *, keys: Keyring, ledger: Ledger, inbox: Callable[[], Inbox],
+    home: OperatorHome, role: Role, name: str, *, keys: Keyring, ledger: Ledger, inbox: Callable[[], Store],
     now: datetime, compromised: bool = False, pause: Callable[[float], None] = time.sleep,
 ) -> Revoked:  # fmt: skip
     """Take a name out of force: the server closes its session at once, the contract ends its right to write.

@@ -1,6 +1,6 @@
 """`status`: what is where, by a home: who is enrolled, connected, waiting or on hold, and what the chain has.
 
-It asks registry, inbox, node and the figures of the running server or robot; whatever of them is not there, the rest is
+It asks registry, store, node and the figures of the running server or robot; whatever of them is not there, the rest is
 shown, and a sentence says what is not known and why. Nothing is changed or made.
 """
 
@@ -18,29 +18,31 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosbridge_eth.config import ServerConfig, load_robot_config, load_server_config
-from rosbridge_eth.config.home import HomeKind, OperatorHome, RobotHome, kind_of
+from rosbridge_eth.config.home import HomeKind, OperatorHome, RobotHome, kind_of, shard_of
 from rosbridge_eth.config.values import counted
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Role
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
+from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.operator.registry import Enrolment, Registry, differences
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger, Standing
+    from rosbridge_eth.server.metrics import Figure
 
 _WEI: Final = 10**18
 ANSWER_TIME = 5.0  # seconds for a node or a monitor
 SPENDING_BLOCKS = 100  # what an account spends is seen by its balance so many blocks ago: geth keeps 128 states
 SEEN = 15.0  # seconds since a worker last saw the session
 FOLLOW_EVERY = 2.0
-DEAD = 1000  # dead letters; the inbox keeps no more
+DEAD = 1000  # dead letters; the store keeps no more
 Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
 FEW_DAYS = 7.0
-Figure = tuple[str, dict[str, str], float]
+FORKED_FOR = 600.0  # seconds for which it is told that a log went on in two places
 _NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
 _SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
@@ -59,24 +61,21 @@ def _asking(report: Report, what: str) -> Iterator[None]:
         report["unknown"].append(f"{what}: {error}")
 
 
-def _running(report: Report, home: Path, otherwise: str, expected: Collection[str] = ()) -> list[Figure]:
-    """What the running processes of this home show; in the report, the conditions that do not hold.
+def _running(report: Report, home: Path, otherwise: str) -> list[Figure]:
+    """What the processes of this home show; in the report, those that were killed and the conditions that do not hold.
 
-    expected: the processes; of a server those that it has started. otherwise: said where none of them beats.
+    otherwise: said where none of them is there.
     """
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.supervisor import MONITOR
 
-    report["process"], found, holds = None, list[Figure](), dict[str, bool]()
-    with suppress(ValueError):  # nothing runs
-        found = metrics.figures(home)
-        expected = expected or {of["process"] for name, of, _ in found if name == "starts"} - {MONITOR}
-        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
-    if not any(holds.get(f"{process} runs") for process in expected):  # or what a killed one left
+    found = metrics.running(home)
+    if not any(found.values()):
         report["unknown"].append(otherwise)
-        return []
-    report["process"] = [name for name, so in holds.items() if not so]
-    return found
+    report["process"] = [
+        failing for process, figures in found.items()
+        for failing in ([f"{process} runs"] if figures is None else metrics.failing(figures))
+    ] if found else None  # fmt: skip
+    return [figure for figures in found.values() for figure in figures or ()]
 
 
 def _add_figures(report: Report, figures: Collection[Figure]) -> None:
@@ -87,7 +86,9 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
     for name, labels, value in sorted(figures, key=lambda figure: figure[2]):
         if (robot := report["robots"].get(labels.get("robot"))) is None:
             continue
-        if name == "session_seen_seconds" and now - value < SEEN:
+        if name == "forked_seconds":
+            robot["forked"] = now - value < FORKED_FOR
+        elif name == "session_seen_seconds" and now - value < SEEN:
             robot |= {"connected": True, "address": labels["address"]}
         elif name in _OF_ROBOT:
             of = robot.setdefault("waiting", {}) if name.startswith("waiting_") else robot
@@ -154,16 +155,19 @@ def fleet(place: OperatorHome) -> RenderableType:
 
 
 def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots: Mapping[bytes, Enrolment]) -> None:
-    from rosbridge_eth.server.supervisor import open_store
+    from rosbridge_eth.server.shard import open_store
 
-    names = {tk: robot.name for tk, robot in robots.items()}
-    with closing(open_store(config, place, read_only=True)) as inbox:
-        for tk, waiting in inbox.totals().items():
-            robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
-            oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
-            hold = inbox.state(tk).hold if waiting.chunks or robot["in_force"] else None
-            robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
-        reasons = Counter((letter.tk, letter.why) for letter in inbox.dead(DEAD))
+    names, reasons = {tk: robot.name for tk, robot in robots.items()}, Counter[tuple[bytes, str]]()
+    for shard in range(config.shards):
+        with suppress(NothingThere), closing(open_store(config, place, shard, read_only=True)) as store:
+            for tk in (each for each in store.sizes() if shard_of(each, config.shards) == shard):
+                waiting, [state] = store.waiting(tk), store.states([tk])
+                robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
+                oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
+                hold = state.hold if waiting.chunks or robot["in_force"] else ""
+                robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
+            reasons.update((letter.tk, letter.why) for letter in store.dead(DEAD)
+                           if shard_of(letter.tk, config.shards) == shard)
     report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
                       for (tk, why), count in reasons.items()]  # fmt: skip
 
@@ -231,6 +235,8 @@ def _alarms(report: Report) -> Iterator[str]:
     for name, robot in report["robots"].items():
         if hold := robot.get("hold"):
             yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
+        if robot.get("forked"):
+            yield f"ALARM: {name}: {FORKED}"
         if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
             yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
     for each in report["dead"]:
@@ -243,9 +249,10 @@ def _alarms(report: Report) -> Iterator[str]:
 def _robot(place: RobotHome) -> Report:
     end, config = place.bridge(), load_robot_config(place.config)
     report: Report = {
-        "robot": end.robot, "server": f"{end.server_name} at {config.server or end.server_address}",
+        "robot": end.robot, "server": f"{end.server_name} at {config.server or end.addresses()[0]}",
         "topics": [topic.topic for topic in config.topics], "nodes": list(config.nodes),
-        "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "unknown": [],
+        "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "alarms": [],
+        "unknown": [],
     }  # fmt: skip
     with _asking(report, "the spool"):
         log = Log(end.ledger, robot_id(end.robot))
@@ -254,11 +261,14 @@ def _robot(place: RobotHome) -> Report:
                 report["spool"] = spool.statistics()._asdict()
         except InUse:
             report["runs"] = True
+            running = _running(report, place.path, _SILENT)
+            seen = [value for name, _, value in running if name == "forked_seconds"]
+            report["alarms"] = [f"ALARM: {FORKED}" for value in seen if time.time() - value < FORKED_FOR]
             wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
                       "trigger_records")  # fmt: skip
             report["figures"] = {
                 " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in _running(report, place.path, _SILENT, ["robot"]) if name in wanted
+                for name, labels, value in running if name in wanted
             }  # fmt: skip
     return report
 
@@ -342,6 +352,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("spool", kept), *_process(report),
         *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
     ])  # fmt: skip
+    yield from report["alarms"]
 
 
 def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:

@@ -2,8 +2,9 @@
 
     source's thread -> ring -> Robot's loop: capture -> writer -> spool -> Sender -> channel
 
-The source's thread only puts raw messages into a bounded ring; everything that has state belongs to the loop.
-Where the ring is full a bag waits, and a live source drops and counts, which becomes `lost` lines of the log.
+The source's thread only puts raw messages into a bounded ring; everything that has state belongs to the loop, which
+lets messages gather for GATHER between two turns. Where the ring is full a bag waits, and a live source drops and
+counts, which becomes `lost` lines of the log.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, parse_address, time_text
+from rosbridge_eth.config.values import Address, counted, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
-from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
+from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
+from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.robot.spool import Spool
 from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)
@@ -42,6 +44,7 @@ _T = TypeVar("_T")
 
 RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread and the loop, and their bytes
 TAKE = 128  # raw messages captured before the network gets its turn again
+GATHER = 0.04  # seconds that messages gather in the ring: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
@@ -65,18 +68,15 @@ class Robot:
     """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
 
     def __init__(
-        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, server: Address,
-        sender: Sender, box: BlackBox | None = None,
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client,
+        servers: Sequence[Address], sender: Sender, box: BlackBox | None = None,
     ) -> None:  # fmt: skip
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
-        self.client, self.sender, self.loop = client, sender, ClientLoop(client, server, self.handle)
-        sender.begin_stream = self.begin_stream
+        self.client, self.sender, self.loop = client, sender, ClientLoop(client, servers, self.handle)
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
-        self.dropped_before = spool.statistics().dropped_bodies
-        """Of the bodies that the full spool gave up, those before this start."""
-        self._marks: deque[tuple[bytes, int, Counter[str]]] = deque()  # stream, number, records sealed up to there
+        self._marks: deque[tuple[bytes, Counter[str]]] = deque()  # place, and records sealed up to there
         self._confirmed = Counter[str]()
         self._ring: deque[RawMessage] = deque()
         self._put = self._taken = 0  # bytes that ever went into the ring, counted by its thread, and out of it
@@ -84,7 +84,7 @@ class Robot:
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
         self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
-        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = float("-inf")
+        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = self._take_at = float("-inf")
         self._synchronised = self._finished = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
@@ -127,17 +127,9 @@ class Robot:
         A chunk holds records of all topics, so what is kept are places of the log and not records. Of more than MARKS
         places that wait every second is left out: then it is less, by less than what one of them stands for.
         """
-        newest = self.sender.statistics.newest
-        done = [index for index, (stream, number, _) in enumerate(self._marks)
-                if newest is not None and stream == newest.stream and number <= newest.number]  # fmt: skip
-        for _ in range(done[-1] + 1 if done else 0):
-            self._confirmed = self._marks.popleft()[2]
+        while self._marks and self._marks[0][0] <= self.sender.newest:
+            self._confirmed = self._marks.popleft()[1]
         return self._confirmed
-
-    def begin_stream(self, refused: bytes) -> None:
-        """The server refused a stream: if it is the one being written, go on in a new one."""
-        if refused == self.writer.stream:
-            self.writer.new_stream()
 
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
@@ -156,8 +148,7 @@ class Robot:
                 else:
                     self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
                 self.loop.seek(now)
-                if now >= self._send_at:
-                    self._spool_or(None, "send", self.sender.send)
+                self._send(now)
                 on_turn()
                 if self._finished and not self._unspooled and self._spool_or(False, "idle", lambda: self.sender.idle):
                     break
@@ -207,7 +198,7 @@ class Robot:
                 self._room.wait(0.2)
         self._put += len(raw.raw)
         self._ring.append(raw)
-        if len(self._ring) == 1:
+        if len(self._ring) == 1 and time.monotonic() >= self._take_at:  # else it wakes by itself
             self.loop.wake()
 
     def _full(self, share: int = 1) -> bool:
@@ -224,6 +215,7 @@ class Robot:
             if self.box.released:  # before anything new, so that no more is kept than was stated
                 self._write(self.box.released.popleft(), now)
             elif self._ring:
+                self._take_at = now + GATHER
                 self._capture(self._ring.popleft(), now)
             else:
                 break
@@ -262,7 +254,7 @@ class Robot:
         self.chunks += len(chunks)
         if chunks:
             last = chunks[-1].header
-            self._marks.append((last.stream, last.number, self.writer.sealed.copy()))
+            self._marks.append((place_of(last), self.writer.sealed.copy()))
             if len(self._marks) > MARKS:
                 self._marks = deque([*self._marks][::-2][::-1])
         if "append" not in self._failing or now - self._spool_at >= SPOOL_AGAIN:
@@ -274,27 +266,34 @@ class Robot:
             self.spool.append(self._unspooled[0])
             self._unspooled.popleft()
 
+    def _send(self, now: float) -> None:
+        """What the spool cannot do is tried again, a second later."""
+        if now >= self._send_at:
+            self._spool_or(None, "send", partial(self.sender.send, now))
+            self._send_at = now + SPOOL_AGAIN if "send" in self._failing else now
+
     def _wait(self, now: float) -> float:
-        if (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
-            return 0.0
         due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
+        if len(self._unspooled) < MAX_UNSPOOLED:
+            if self.box.released or len(self._ring) >= TAKE or (self._ring and self._source_ended.is_set()):
+                return 0.0
+            if self._ring or self._take_at > now:  # until then nobody wakes the loop for a message
+                due = min(due, self._take_at - now)
         return max(0.0, min(LONGEST_WAIT, due))
 
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.statistics.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
+        while self.sender.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
             if (now := time.monotonic()) >= deadline:
                 break
             self._spool_chunks([], now)
-            self._spool_or(None, "send", self.sender.send)
+            self._send(now)
             self.loop.step(0.02)
 
     def handle(self, event: Event) -> None:
-        """Take one event of the client. What the spool cannot note is asked for again, a second later."""
-        now = time.monotonic()
-        self._spool_or(None, "note", partial(self.sender.handle, event, now))
-        self._send_at = now + SPOOL_AGAIN if "note" in self._failing else now
+        """Take one event of the client."""
+        self.sender.handle(event, time.monotonic())
 
     def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
         """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
@@ -311,7 +310,7 @@ class Robot:
         return given
 
     def _summarise(self) -> str:
-        spool, sender = self.spool.statistics(), self.sender.statistics
+        spool, sender = self.spool.statistics(), self.sender
         lost = {
             "messages lost before they could be captured": sum(self.source.lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
@@ -320,7 +319,7 @@ class Robot:
                 len(self._ring) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
             f"chunks dropped, since the {'disk was full' if self.spool.disk_was_full else 'spool was at its max_size'}":
-                spool.dropped_bodies - self.dropped_before,
+                spool.dropped_bodies,
             "chunks refused by the server": sender.refused,
         }
         parts = [f"{counted(self.captured, 'record')} captured in {counted(self.chunks, 'chunk')}"]
@@ -328,8 +327,8 @@ class Robot:
         if not spool.unstored:
             return ", ".join([*parts, "nothing waits for the server."])
         line = ", ".join([*parts, f"{counted(spool.unstored, 'chunk')} not yet at the server"])
-        if sender.refusal is not None:
-            return f"{line}: {sender.refusal}."
+        if why := sender.held or sender.refusal:
+            return f"{line}: {why}."
         if not sender.sessions:
             return f"{line}: there was no session yet when it was stopped."
         return f"{line}: it was stopped before the server had them; the next start sends them."
@@ -402,19 +401,23 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     key = identity.signing_key
     spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
     now = time.monotonic()
+    # A robot that begins in 1970, its disk lost, begins its log behind what was written under its name before.
+    known = max(certificate_clock(home)(), identity.public.not_before)
+    since = int(known.timestamp() * 1000 - 1).to_bytes(8, "big") + bytes(STREAM_SIZE - 8)
     first_line = stream_line(source.kind, f"rosbridge_eth {__version__}")
     writer = LogWriter(
-        place, key, readers, previous=spool.last_digest, stream_line=first_line,
-        period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress, now=now,
+        place, key, readers, previous=spool.last_digest, newest=max(spool.newest[:STREAM_SIZE], since),
+        stream_line=first_line, period=config.log.period, heartbeat=config.log.heartbeat, compress=config.log.compress,
+        now=now,
     )
     client = Client(
         ClientConfig(mode=Mode[config.channel.upper()]), identity, Trust(roots), end.server_name, now,
         wall=certificate_clock(home),
     )
-    sender = Sender(client, spool, channel=config.channel, on_server_time=partial(keep_time, home))
+    sender = Sender(client, spool, writer, channel=config.channel, on_server_time=partial(keep_time, home))
     return Robot(
         source=source, capture=capture, writer=writer, spool=spool, client=client,
-        server=config.server or parse_address(end.server_address), sender=sender, box=box,
+        servers=[config.server] if config.server else end.addresses(), sender=sender, box=box,
     )
 
 

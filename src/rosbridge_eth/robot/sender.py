@@ -1,26 +1,44 @@
-"""The robot's end of the hop to the server: asks what is there of a stream, and sends what follows. Sans-IO.
+"""The robot's end of the hop: sends what follows the server's head, from the robot's own disk.
 
-The one rule: the server's word for what is there, the robot's for what follows. Streams are gone through in the order
-of the log, each begun with the question what the server has of it (protocol.Where); a session begins with the oldest
-chunk that is not confirmed on the chain.
+The server's last word (log/hop.py) says how far it has the log, and that is all that is remembered of it: what follows
+is sent as long as the session takes it, again from the head where the server did not take it, and nothing while it
+says why not. A chunk that it will never take is set aside. What is confirmed on the chain leaves the disk.
+
+The log forked where the server's head is no chunk of this robot's and what follows here does not follow it: another
+machine has this robot's identity, or the disk was put back from an old copy. Then nothing is sent or removed, and it
+is told. Sans-IO but for the spool; `now` is seconds of a clock that does not jump.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from rosbridge_eth import protocol
-from rosbridge_eth.channel import Client, Connected, Disconnected, Event, HandshakeFailed, Message, Reason, Unresolved
-from rosbridge_eth.errors import StoreError
-from rosbridge_eth.protocol import Confirmed, Hold, Offer, ProtocolError, Refused, Stored, Where
-from rosbridge_eth.spool import Spool
+from rosbridge_eth.channel import (
+    Client,
+    Connected,
+    Disconnected,
+    End,
+    Event,
+    HandshakeFailed,
+    Message,
+    Reason,
+    Unresolved,
+)  # fmt: skip
+from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk
+from rosbridge_eth.log.hop import FORKED, HopError, ServerState, encode_offer
+from rosbridge_eth.log.store import NO_DIGEST, NOWHERE
+from rosbridge_eth.log.writer import LogWriter
+from rosbridge_eth.robot.spool import Spool
 
 log = logging.getLogger(__name__)
 
-READ_AHEAD = 256 * 1024  # bytes of chunks read from the spool at a time
+AT_ONCE = 32  # chunks that are looked up on the disk at a time
 SAY_AGAIN = 60.0  # seconds before the same reason why nothing is sent is said once more
+TWICE = (
+    "another session took the place of this one: another machine has this robot's identity; `revoke` it,"
+    " `register --replace` it, and `join` the new bundle in a new folder, on one machine"
+)
 
 
 def mend(failure: HandshakeFailed, channel: str) -> str:
@@ -37,7 +55,7 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
                 " server's made anew (`renew`)"
             )
         case Reason.FULL:
-            return "wait, or ask the operator for more `workers` (server.toml)"
+            return "wait, or ask the operator for more `shards` (server.toml)"
         case _:
             return (
                 "is it up, is the address right, is UDP let through, and does it take"
@@ -45,107 +63,89 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
             )
 
 
-@dataclass(slots=True)
-class SenderStatistics:
-    """Chunks by what became of them in this process, and the session."""
-
-    sent: int = 0
-    refused: int = 0
-    sessions: int = 0
-    connected: bool = False
-    held: str | None = None
-    """Why the server wants nothing at this moment."""
-    confirmed: int = 0
-    newest: Confirmed | None = None
-    """What the server said last of what is confirmed."""
-    refusal: str | None = None
-    """Why there has been no session since the last one, and what to do about it."""
-
-
 class Sender:
-    """From the spool through the channel: asks what the server has of a stream, and sends what follows. Sans-IO.
+    """One robot's; give it every event of the client, and call `send` in every turn.
 
+    writer: its streams are named above what the server has; one of which the server refuses a chunk is ended.
     on_server_time: is given the server's authenticated time (seconds since 1970) at each new session.
+
+    sent, refused, confirmed: chunks in this process, by what became of them; sessions: how many there were.
+    held: why nothing is sent at this moment. refusal: why there is no session, and what to do about it.
+    state: what the server said last, None before it says anything in this session.
     """
 
     def __init__(
-        self, client: Client, spool: Spool, *, channel: str = "exchange",
+        self, client: Client, spool: Spool, writer: LogWriter, *, channel: str = "exchange",
         on_server_time: Callable[[float], None] = lambda seconds: None,
     ) -> None:  # fmt: skip
-        self._client, self._spool, self._channel = client, spool, channel
+        self._client, self._spool, self._writer, self._channel = client, spool, writer, channel
         self._on_server_time = on_server_time
-        self.begin_stream: Callable[[bytes], None] = lambda refused: None
-        """Called when the server refused a stream, which may be the one that is being written."""
+        self.sent = self.refused = self.confirmed = self.sessions = 0
+        self.connected = False
+        self.held = self.refusal = ""
+        self.state: ServerState | None = None
+        self.newest, self.block = NOWHERE, 0
+        """The newest place that is confirmed on the chain, and the block that has it, as the server said last."""
+        self._sent, self._digest = NOWHERE, NO_DIGEST  # up to where this session has the log, or will
+        self._noted: ServerState | None = None  # what was done on the disk of what the server said
+        self._offered = NOWHERE  # what was sent to show that the log forked
         self._said: dict[str, float] = {}  # reason -> when it was said
-        self._stream: bytes | None = None  # being sent; None: the next one is to be asked about
-        self._sent: int | None = None  # the newest number of it that went out in this session, or that is stored
-        self._stored: int | None = None  # the newest number of it that the server has
-        self._asked = False  # a question is out, or a hold is on: nothing is sent until the next Stored
-        self.statistics = SenderStatistics()
 
     @property
     def idle(self) -> bool:
-        """The server has all that the spool has."""
-        return self._spool.statistics().unstored == 0
+        """The server has all that is on the disk."""
+        state = self.state
+        return state is not None and not self.held and not self._spool.rows(state.head, 1)
 
-    def send(self) -> None:
-        """Send as much as the session takes."""
-        if not self.statistics.connected or self._asked:
-            return
-        if self._stream is None:
-            self._ask(self._spool.next_stream(b""))
-            return
-        if not self._client.writable():
-            return
-        for chunk in self._spool.following(self._stream, self._sent, READ_AHEAD):
-            if not self._put(Offer(chunk.encoded)):
-                return
-            self._sent = chunk.header.number
-            self.statistics.sent += 1
-        if self._sent == self._stored:
-            self._ask(self._spool.next_stream(self._stream))
+    @property
+    def forked(self) -> bool:
+        """Whether another machine, or an older life of this one, has written into this robot's log."""
+        return self.held == FORKED or self.refusal == TWICE
 
-    def _put(self, message: protocol.Up) -> bool:
-        """Send it, if there is room."""
-        encoded = protocol.encode(message)
-        if not self._client.writable(len(encoded)):
-            return False
-        self._client.send(encoded)
-        self._client.expecting(True)
-        return True
-
-    def _ask(self, place: tuple[bytes, int, bytes] | None) -> None:
-        if place is not None and self._put(Where(*place)):
-            self._stream, self._sent, self._stored, self._asked = place[0], None, None, True
+    # What comes
 
     def handle(self, event: Event, now: float) -> None:
-        """Take one event of the client. StoreError where the spool cannot note it; then it is asked for again."""
         match event:
             case Connected(peer=peer, server_time=server_time):
-                self.statistics.sessions += 1
-                self.statistics.connected = True
-                self.statistics.refusal = None
-                self._stream, self._asked = None, False
+                self.sessions += 1
+                self.connected, self.state, self.refusal = True, None, ""
+                self._client.expecting(True)
                 log.info("connected to %s", peer)
                 if server_time is not None and server_time <= peer.not_after:  # else its clock is wrong
                     self._on_server_time(server_time.timestamp())
             case Disconnected(reason=reason):
-                self.statistics.connected, self.statistics.held = False, None
+                self.connected, self.state, self.held = False, None, ""
                 log.info("disconnected: %s", reason)
+                if reason is End.REPLACED:
+                    self.refusal = TWICE
+                    self._warn(TWICE, TWICE, now)
             case HandshakeFailed(why=why) | Unresolved(why=why):
                 todo = "" if isinstance(event, Unresolved) else f"; {mend(event, self._channel)}"
-                self.statistics.refusal = why + todo
-                self._warn(why, f"no session: {self.statistics.refusal}", now)
+                self.refusal = why + todo
+                self._warn(why, f"no session: {self.refusal}", now)
             case Message(payload=payload):
-                try:
-                    self._take(protocol.decode_down(payload), now)
-                except ProtocolError as error:
-                    why = "the server says what is no message here; use the same version on both ends"
-                    self.statistics.refusal = why
-                    self._warn(why, f"{why} ({error})", now)
-                except StoreError:  # not noted: ask again, and the server says it again
-                    self._stream, self._asked = None, False
-                    raise
+                self.take(payload, now)
+
+    def take(self, data: bytes, now: float) -> None:
+        """Take the bytes of the server's state; what comes of it is done by `send`."""
+        try:
+            state = ServerState.decode(data)
+        except HopError as error:
+            self.refusal = "the server says what is no message here; use the same version on both ends"
+            self._warn(self.refusal, f"{self.refusal} ({error})", now)
+            return
+        known = self.state
+        if known is None or state.again != known.again or not known.head <= state.head <= self._sent:
+            self._sent, self._digest = state.head, state.digest
+        if known is None or state.head > known.head:
+            self._client.progressed()
+        if state.confirmed > self.newest:
+            self.newest, self.block = state.confirmed, state.block
+        self.state = state
+        self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
+        self._client.expecting(self._sent > state.head and not state.why)
+        if state.why:
+            self._warn(state.why, f"the server takes nothing at this moment: {state.why}", now)
 
     def _warn(self, why: str, text: str, now: float) -> None:
         """At most once a minute for the same reason."""
@@ -153,36 +153,67 @@ class Sender:
             self._said[why] = now
             log.warning("%s", text)
 
-    def _take(self, message: protocol.Down, now: float) -> None:
-        match message:
-            case Stored() if self.statistics.held is not None:  # it takes chunks again: ask from the beginning
-                self._stream, self._asked, self.statistics.held = None, False, None
-            case Stored(stream=stream, number=number) if stream == self._stream:
-                if self._asked:  # the server's word for what is there, ours for what follows
-                    self._spool.lost(stream, number)
-                    self._sent, self._asked = number, False
-                self._stored = number
-                if number is not None:
-                    self._spool.stored(stream, number)
-                    self._client.progressed()
-                self._client.expecting(self._sent != self._stored)
-                log.debug("stream %s: the server has it up to %s", stream.hex(), number)
-            case Confirmed(stream=stream, number=number):
-                self.statistics.confirmed += self._spool.confirmed(stream, number)
-                self.statistics.newest = message
-                log.debug("stream %s: confirmed up to %d", stream.hex(), number)
-            case Hold(why=why):
-                self._asked, self.statistics.held = True, why
-                self._client.expecting(False)
-                self._warn(why, f"the server takes nothing at this moment: {why}", now)
-            case Refused(stream=stream, number=number, why=why):
-                aside = self._spool.set_aside(stream, number)
-                self.statistics.refused += aside
-                log.error(
-                    "the server refuses chunk %d of stream %s: %s; %d chunks are set aside and a new stream begins",
-                    number, stream.hex(), why, aside,
-                )
-                self.begin_stream(stream)
-                if stream == self._stream:
-                    self._stream, self._asked = None, False
-                    self._client.expecting(False)
+    # What goes
+
+    def send(self, now: float) -> None:
+        """Do what the server's state asks for, and send as much as the session takes. StoreError: call it again."""
+        state = self.state
+        if state is None:
+            return
+        if self._noted is not state:
+            self._note(state)
+            self._noted = state
+        self.held = state.why
+        if state.why:
+            return
+        if self._writer.stream and state.head[:STREAM_SIZE] > self._writer.stream:
+            self._fork(self._spool.newest, now)  # what this process wrote stands below what somebody else did
+            return
+        while self._sent < self._spool.newest and (rows := self._spool.rows(self._sent, AT_ONCE)):
+            for row in rows:
+                [encoded] = self._spool.chunks([row.place])
+                previous = Chunk.parse(encoded).header.previous
+                if previous != self._digest and self._spool.has(previous):
+                    self._fork(row.place, now)
+                    return
+                if not self._put(encoded, b"" if previous == self._digest else self._digest):
+                    return
+                self._sent, self._digest = row.place, row.digest
+
+    def _note(self, state: ServerState) -> None:
+        """Take from the disk what is confirmed, and set aside what is refused."""
+        if self._written(state.confirmed):  # else another machine wrote it, and not what stands below it here
+            self.confirmed += self._spool.confirmed(state.confirmed)
+        if self._written(state.head) or (self._noted is not None and state.head < self._noted.head):
+            self._spool.stored(state.head)
+        if state.refused != NO_DIGEST and (place := self._spool.set_aside(state.refused)):
+            self.refused += 1
+            log.error(
+                "the server refuses chunk %d of stream %s, since its signature or its body is wrong; it is set aside"
+                " and a new stream begins", int.from_bytes(place[STREAM_SIZE:], "big"), place[:STREAM_SIZE].hex(),
+            )  # fmt: skip
+            if place[:STREAM_SIZE] == self._writer.stream:
+                self._writer.new_stream()
+
+    def _written(self, place: bytes) -> bool:
+        """Whether the chunk there is this robot's own; not known of one that has left the disk."""
+        before = max(0, int.from_bytes(place, "big") - 1).to_bytes(len(place), "big")
+        return place in (NOWHERE, self._spool.newest, *(row.place for row in self._spool.rows(before, 1)))
+
+    def _fork(self, place: bytes, now: float) -> None:
+        """Send nothing more, but once the chunk at `place`, so that the server knows, too."""
+        self.held = FORKED
+        self._warn(FORKED, FORKED, now)
+        if place != self._offered:
+            [encoded] = self._spool.chunks([place])
+            self._offered = place if self._put(encoded) else NOWHERE
+
+    def _put(self, encoded: bytes, after: bytes = b"") -> bool:
+        """Send it, if there is room."""
+        offer = encode_offer(encoded, after)
+        if not self._client.writable(len(offer)):
+            return False
+        self._client.send(offer)
+        self._client.expecting(True)
+        self.sent += 1
+        return True

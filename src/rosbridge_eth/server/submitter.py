@@ -1,15 +1,13 @@
-"""Brings what is in the inbox onto the chain: look, compare, send what is missing. Level-triggered, without a journal.
+"""Brings what is in the store onto the chain: look, compare, send what is missing. Level-triggered, without a journal.
 
 A turn looks at how every robot stands in the contract (how many chunks, the hash of the last: `tail`), finds the row
-with that hash in the inbox, and sends what follows it, in batches. The contract takes a batch only if it follows
-what is there, so nothing can be written twice or out of order, whatever is sent; all that is decided here is what
-not to waste gas on. What is in flight is kept in memory only; after a restart it is waited for.
+with that hash in the store, and sends what follows it up to the store's head, in batches. The contract takes a batch
+only if it follows what is there, so nothing can be written twice or out of order, whatever is sent; all that is
+decided here is what not to waste gas on. What is in flight is kept in memory only; after a restart it is waited for.
 
-    the tail is no row (the inbox was lost, or put back   read the batches back from the last one, until it is known
-    from an old copy), or a row does not follow the one   which rows are on the chain; those go, the last confirmed
-    in front and the inbox does not know all that was     chunk and what is behind it on the chain stand in front of
-    ever written                                          the others; heads are raised, so that a robot which sends
-                                                          them again is told they are known
+    the tail is neither a row nor in front of the first   the store's head is set to that chunk, which the contract's
+    one: the store was lost or put back from an old       last event has; the robot is told so, and sends what follows
+    copy, or another submitter writes for the robot
     the pool has fewer transactions than are in flight    the missing ones again, at today's price or the same
     the pool has more: a restart, somebody else           wait 30 s, then send over them
     nothing moved for 30 s                                all in flight again, an eighth dearer or at today's price
@@ -24,17 +22,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from eth_hash.auto import keccak
 
 from rosbridge_eth.errors import ChainError
-from rosbridge_eth.inbox import Head, Inbox, Row
 from rosbridge_eth.ledger import contract
 from rosbridge_eth.ledger.contract import Block, Fees, Ledger, Standing
 from rosbridge_eth.ledger.transport import AlreadyKnown, NonceTooLow, OutOfFunds, Reverted, Underpriced
 from rosbridge_eth.log.chunk import Chunk, Header, Malformed
-from rosbridge_eth.server.walk import Walk
+from rosbridge_eth.log.store import NOWHERE, Row, State, Store, place_of
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount
@@ -46,12 +43,10 @@ PATIENCE = 30.0  # seconds without progress, before something is done about it
 BUSY, IDLE, LONGEST_PAUSE = 0.25, 1.0, 30.0  # seconds to the next turn
 SEND_BYTES = 2**22  # of transactions, handed to the node at once
 TOP_UPS = 20  # sent together; the next ones when all of them are in blocks
-WALK = 50  # batches read back for one robot in one turn
 ROWS = IN_FLIGHT * BATCH_BYTES // 203  # no chunk is smaller than 203 bytes
-MINUTE, DAY = 60.0, 86_400.0
-BURST = 3600.0  # seconds of a robot's gas that it may use at once
-ALL = bytes(16)
-"""No robot has this stream: a head for it says that the inbox knows the head of every stream on the chain."""
+_MOST = contract.BALANCE_LIMIT // 2  # that is waited for on an account
+MINUTE, HOUR, DAY = 60.0, 3600.0, 86_400.0
+BURST = HOUR  # seconds of a robot's gas that it may use at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +74,14 @@ class Batch(NamedTuple):
         return self.first + len(self.rows)
 
 
+class Look(NamedTuple):
+    """A robot in the contract, there at the block that confirms (None: not known), and in the store."""
+
+    standing: Standing
+    then: Standing | None
+    state: State
+
+
 @dataclass(slots=True)
 class Account:
     """What is remembered of a robot, and of the operator, between two turns."""
@@ -88,9 +91,9 @@ class Account:
     fees: Fees | None = None  # what those offer
     since: float = 0.0  # of the last progress
     careful: bool = False  # the next batch is tried first
-    hold: str | None = None  # why nothing is written
-    walk: Walk | None = None
-    new: bytes = b""  # digest of a row that is known not to be on the chain
+    hold: str = ""  # why nothing is written
+    quiet: Look | None = None  # the last look, where it found nothing to do
+    final: tuple[bytes, bytes] = (contract.NOTHING, NOWHERE)  # hash and place of the last chunk that is confirmed
     gas: float = 0.0  # that may be used now
     gas_at: float = 0.0
 
@@ -100,11 +103,12 @@ class Account:
 
 
 class Work(NamedTuple):
-    """A robot with something to send or in flight. after: the position of the chain's tail in the inbox."""
+    """A robot with rows that are not on the chain: those behind the place `after`, up to `head`."""
 
     tk: bytes
     standing: Standing
-    after: int | None
+    after: bytes
+    head: bytes
     oldest: float
 
 
@@ -115,21 +119,24 @@ class _Hold(Exception):
 class Submitter:
     """The one that writes. `turn` does what there is to do now.
 
-    robots: the Tk of all registered robots. account: the key that writes for a robot, None where there is none; asked
-    often. operator: pays for the robots' accounts, None where somebody else does.
+    robots: the Tk of the registered robots that it writes for. account: the key that writes for a robot, None where
+    there is none; asked often. operator: pays for the robots' accounts, None where somebody else does; `others`: the Tk
+    of robots that are written for elsewhere and paid for here.
     """
 
     def __init__(
-        self, ledger: Ledger, inbox: Inbox, robots: Callable[[], Collection[bytes]],
+        self, ledger: Ledger, store: Store, robots: Callable[[], Collection[bytes]],
         account: Callable[[bytes], LocalAccount | None], operator: LocalAccount | None, settings: Settings,
+        others: Callable[[], Collection[bytes]] = tuple,
     ) -> None:  # fmt: skip
-        self._ledger, self._inbox, self._robots = ledger, inbox, robots
+        self._ledger, self._store, self._robots, self._others = ledger, store, robots, others
         self._account, self._operator, self._settings = account, operator, settings
         self._known: dict[bytes, Account] = {}
-        self._funds = Account()
+        self._funds, self._paid = Account(), list[Standing]()
         self._fees = Fees(0, 0)
         self._pause = IDLE
-        self._looked_at = self._cleaned_at = 0.0
+        self._looked_at = self._minute_at = self._hour_at = 0.0
+        self.asked: set[bytes] = set()  # robots at which it looked, so that the store knows what the chain has of them
         self.trouble: str | None = None  # why nothing can be written at all
         self.unconfirmed: str | None = None  # why nothing can be confirmed
         self.funds: str | None = None  # why accounts are not topped up
@@ -140,7 +147,7 @@ class Submitter:
         self.counts: Counter[str] = Counter()
 
     def turn(self, now: float) -> float:
-        """now: seconds since 1970. Seconds until the next turn is wanted. StoreError of the inbox passes through."""
+        """now: seconds since 1970. Seconds until the next turn is wanted. StoreError passes through."""
         try:
             if self.head is None or self.trouble is not None:  # whose place another chain may have taken
                 self._ledger.check()
@@ -149,11 +156,13 @@ class Submitter:
                 return BUSY
             self.head, self._looked_at = head, now
             self.trouble = None
-            busy = self._look(head, now)
-            if not 0 <= now - self._cleaned_at < MINUTE:
-                self._inbox.forget(now - DAY)
+            if minute := not 0 <= now - self._minute_at < MINUTE:
+                self._minute_at = now
                 self.operator_balance = self._ledger.balance(self._operator.address) if self._operator else None
-                self._cleaned_at = now
+                self._paid = self._ledger.standings(list(self._others())) if self._operator else []
+            busy = self._look(head, now)
+            if minute:
+                self._forget(now)
         except ChainError as error:
             self.trouble, self._looked_at = str(error), float("-inf")
             self._pause = min(2 * self._pause, LONGEST_PAUSE)
@@ -161,30 +170,32 @@ class Submitter:
         self._pause = IDLE
         return BUSY if busy else IDLE
 
+    def _forget(self, now: float) -> None:
+        """Confirmed rows that are a day old, looked for once an hour, or fill half of a robot's share."""
+        half, hour = self._store.max_bytes_per_robot // 2, not 0 <= now - self._hour_at < HOUR
+        self._hour_at = now if hour else self._hour_at
+        for tk, size in self._store.sizes().items():
+            if tk in self.standings and (hour or size > half):
+                self._store.forget(tk, now - DAY, half)
+
     # ------------------------------------------------------------------ look
 
     def _look(self, head: Block, now: float) -> bool:
         """Whether there is something to send or in flight."""
-        self._inbox.append([], now)  # InboxExchanged, if it was
         self._fees = self._ledger.fees(head).limited(self._settings.max_fee)
         # Before the balances: what is in a block by now is in them, so nobody is topped up twice.
         [funds] = self._ledger.nonces([self._operator.address]) if self._operator else [(0, 0)]
         robots = list(self._robots())
         self.standings = standings = dict(zip(robots, self._ledger.standings(robots), strict=True))
-        self._confirm(standings, head, now)
+        then = self._then(robots, head)
         work = []
-        for tk, standing in standings.items():
+        for tk, state in zip(robots, self._store.states(robots), strict=True):
             account = self._known.setdefault(tk, Account(gas=self._settings.gas_per_day * BURST / DAY, gas_at=now))
-            try:
-                after = self._place(tk, account, standing, now)
-                if rows := self._inbox.rows(tk, after, 1):
-                    work.append(Work(tk, standing, after, rows[0].taken_at))
-                else:
-                    account.hold, account.flights = None, []
-            except _Hold as why:
-                account.hold, account.flights = str(why), []
-            certificates = contract.NOTHING if standing.revoked else standing.certificates_hash
-            self._inbox.set_state(tk, hold=account.hold, certificates_hash=certificates)
+            look = Look(standings[tk], then.get(tk), state)
+            if look != account.quiet:
+                found = self._look_at(tk, account, look)
+                work += found
+                account.quiet = None if found or account.hold else look
         if head.base_fee is not None and head.base_fee > self._settings.max_fee:
             self.trouble = f"a unit of gas costs {head.base_fee / 10**9:.1f} gwei, which is above max_fee_gwei"
         else:
@@ -193,23 +204,81 @@ class Submitter:
             self._top_up(work, funds, now)
         return bool(work)
 
-    def _confirm(self, standings: Mapping[bytes, Standing], head: Block, now: float) -> None:
+    def _then(self, robots: Sequence[bytes], head: Block) -> Mapping[bytes, Standing]:
+        """How the robots stood at the newest block that counts as confirmed."""
         block = head.number - self._settings.confirmations + 1
-        if block <= 0:
-            return
+        if block <= 0 or self._settings.confirmations == 1:
+            return self.standings if block > 0 else {}
         try:
-            then = self._ledger.standings(list(standings), block)
-            self.unconfirmed = None
+            then = self._ledger.standings(robots, block)
         except ChainError as error:
             self.unconfirmed = f"the node does not tell how block {block} was: {error}"
-            return
-        for tk, standing in zip(standings, then, strict=True):
-            position = self._inbox.find(tk, standing.tail) if standing.chunks else None
-            if position is not None or not standing.chunks:
-                self._inbox.confirm(tk, position, now, standing.data_block)
+            return {}
+        self.unconfirmed = None
+        return dict(zip(robots, then, strict=True))
 
-    def _place(self, tk: bytes, account: Account, standing: Standing, now: float) -> int | None:
-        """The position of the row that is the chain's last chunk; None: there is none yet."""
+    def _look_at(self, tk: bytes, account: Account, look: Look) -> list[Work]:
+        """Compare one robot's log in the store with what the chain has of it; what there is to send."""
+        standing, then, state = look
+        found: list[Work] = []
+        certificates = contract.NOTHING if standing.revoked else standing.certificates_hash
+        changes: dict[str, Any] = {"certificates": certificates}
+        try:
+            after = self._place(tk, standing, state)
+            if then is not None:
+                changes |= self._confirmed(tk, account, then, state)
+            self.asked.add(tk)
+            self._may_write(tk, standing)
+            if after is not None and (rows := self._store.rows(tk, after, 1)) and rows[0].place <= state.head:
+                found.append(Work(tk, standing, after, state.head, rows[0].taken_at))
+            else:
+                account.hold, account.flights = "", []
+        except _Hold as why:
+            account.hold, account.flights = str(why), []
+        changes["hold"] = account.hold
+        if any(getattr(state, name) != value for name, value in changes.items()):
+            self._store.set_state(tk, **changes)
+        return found
+
+    def _place(self, tk: bytes, standing: Standing, state: State) -> bytes | None:
+        """The place behind which the rows are not on the chain; None: the store followed the chain just now."""
+        if standing.tail == state.base or standing.account is None:
+            return NOWHERE
+        place = self._store.find(tk, standing.tail)
+        if place is not None and place <= state.head:
+            return place
+        self._store.follow(tk, standing.tail, self._last(tk, standing))
+        self.counts["followed"] += 1
+        return None
+
+    def _confirmed(self, tk: bytes, account: Account, then: Standing, state: State) -> dict[str, Any]:
+        """What the state is to say of the last chunk that is confirmed; nothing new where it is not known."""
+        if then.tail != account.final[0]:
+            place = NOWHERE if not then.chunks else self._store.find(tk, then.tail)
+            if place is None and then.tail == state.base and (header := self._last(tk, then)):
+                place = place_of(header)  # the store followed the chain, and has no row of it
+            if place is None:
+                return {}
+            account.final = (then.tail, place)
+        return {"confirmed": account.final[1], "block": then.data_block}
+
+    def _last(self, tk: bytes, standing: Standing) -> Header | None:
+        """The header of the robot's last chunk on the chain, None if it has none."""
+        if not standing.chunks:
+            return None
+        try:
+            event = next(self._ledger.newest_data(tk, standing.data_block), None)
+        except ChainError as error:
+            raise _Hold(f"its last chunk on the chain cannot be read: {error}") from error
+        chunk = event.chunks[-1] if event and event.chunks else b""
+        if keccak(chunk) != standing.tail:
+            raise _Hold("the chain changed while its last chunk was read")
+        try:
+            return Chunk.parse(chunk).header
+        except Malformed as error:
+            raise _Hold(f"what another program wrote is on the chain: {error}") from error
+
+    def _may_write(self, tk: bytes, standing: Standing) -> None:
         key = self._account(tk)
         if standing.account is None:
             raise _Hold("it is not registered in the contract")
@@ -217,75 +286,6 @@ class Submitter:
             raise _Hold("it is revoked")
         if key is None or key.address != standing.account:
             raise _Hold(f"it writes with account {standing.account}, whose key is not here")
-        if not standing.chunks:
-            return None
-        position = self._inbox.find(tk, standing.tail)
-        if position is None:
-            first = self._headers(tk, [row.position for row in self._inbox.rows(tk, None, 1)])
-            self._walk(tk, account, standing, first[0] if first else None, now)
-            position = self._inbox.find(tk, standing.tail)
-        return position
-
-    # ------------------------------------------------------------------ compare
-
-    def _rows(self, work: Work, account: Account, now: float) -> list[Row]:
-        """The rows behind the chain's tail, as far as it is known that they are not on the chain."""
-        tk, standing, after, _ = work
-        whole = self._inbox.head(tk, ALL) is not None
-        if after is None and not whole:
-            self._inbox.raise_heads(tk, {ALL: Head(0, contract.NOTHING)})
-        if after is None or whole:
-            return self._inbox.rows(tk, after, ROWS)
-        rows = self._inbox.rows(tk, after, 8 * IN_FLIGHT)
-        front, *headers = self._headers(tk, [after, *(row.position for row in rows)])
-        for count, header in enumerate(headers):
-            behind = header.stream == front.stream and header.number > front.number
-            if not behind and header.previous != front.digest and header.digest != account.new:
-                if count == 0:
-                    self._walk(tk, account, standing, header, now)
-                return rows[:count]
-            front = header
-        return rows
-
-    def _headers(self, tk: bytes, positions: Sequence[int]) -> list[Header]:
-        return [Chunk.parse(chunk).header for chunk in self._inbox.chunks(tk, positions)]
-
-    def _walk(self, tk: bytes, account: Account, standing: Standing, oldest: Header | None, now: float) -> None:
-        """Read back until it is known whether `oldest` is on the chain, the first of the rows in question (None: there
-        are none); then make the inbox follow. Goes on in the next turn where that takes long.
-
-        What is not confirmed becomes rows again: the chain may turn back, and the robot not send it any more.
-        """
-        final = (self.head.number if self.head else 0) - self._settings.confirmations + 1
-        walk = account.walk = account.walk or Walk(self._ledger.newest_data(tk, standing.data_block), final)
-        try:
-            for count, event in enumerate(walk.events, 1):
-                walk.add(event)
-                if walk.settles(oldest):
-                    break
-                if count == WALK:
-                    raise _Hold("what is on the chain is being read")
-            else:
-                walk.heads[ALL] = Head(0, contract.NOTHING)  # nothing is left that was not read
-        except ChainError as error:
-            account.walk = None
-            raise _Hold(f"what is on the chain cannot be read: {error}") from error
-        account.walk = None
-        self.counts["walks"] += 1
-        if not walk.newest or keccak(walk.newest[0]) != standing.tail:
-            raise _Hold("the chain changed while it was read")
-        self._inbox.raise_heads(tk, walk.heads)  # from here on, nothing of it is taken
-        after = self._inbox.find(tk, standing.tail)
-        if after is None or any(row.digest in walk.on_chain for row in self._inbox.rows(tk, after, 2**31)):
-            try:
-                front = [Chunk.parse(encoded) for encoded in reversed(walk.newest)]
-            except Malformed as error:
-                raise _Hold(f"what another program wrote is on the chain: {error}") from error
-            self._inbox.rebase(tk, front, walk.on_chain, now)
-            account.flights = []
-            self.counts["rebases"] += 1
-        if oldest is not None and oldest.digest not in walk.on_chain:
-            account.new = oldest.digest
 
     # ------------------------------------------------------------------ send
 
@@ -306,7 +306,7 @@ class Submitter:
         for w, (latest, pending) in sorted(steady, key=lambda item: item[0].oldest):
             account = self._known[w.tk]
             try:
-                rows = self._rows(w, account, now)
+                rows = [row for row in self._store.rows(w.tk, w.after, ROWS) if row.place <= w.head]
                 self._reconcile(account, w.standing, rows, latest, now)
                 if (again := self._again(account, latest, pending, now)) is None:
                     continue
@@ -332,9 +332,9 @@ class Submitter:
             self.counts["surprises"] += 1
         elif mined:
             account.careful = False
-        flown = [(row.position, row.digest) for batch in account.flights for row in batch.rows]
-        if flown != [(row.position, row.digest) for row in rows[: len(flown)]]:
-            account.flights = []  # the rows are others now, or stand elsewhere: robots filled a lost inbox again
+        flown = [row.hash for batch in account.flights for row in batch.rows]
+        if flown != [row.hash for row in rows[: len(flown)]]:
+            account.flights = []  # the rows are others now: the store was lost and filled again
         if done or account.nonce is None:
             account.since = now
         account.nonce = latest
@@ -374,7 +374,7 @@ class Submitter:
             if not self._affords(account, used, now):
                 account.hold = "it used the gas of its day (gas_per_day); more comes by the hour"
                 break
-            account.hold = None
+            account.hold = ""
             self.gas[work.tk] += used
             new.append(batch)
             rest, first, front = rest[len(batch.rows) :], batch.end, batch.rows[-1].hash
@@ -383,7 +383,7 @@ class Submitter:
 
     def _try(self, work: Work, account: Account, batch: Batch, now: float) -> None:
         """_Hold if the contract would refuse it; asked again every PATIENCE."""
-        if account.hold is not None and not account.due(now):
+        if account.hold and not account.due(now):
             raise _Hold(account.hold)
         try:
             self._ledger.call(work.standing.account or "", self._calldata(work.tk, batch), gas=batch.gas)
@@ -404,7 +404,7 @@ class Submitter:
         return True
 
     def _calldata(self, tk: bytes, batch: Batch) -> bytes:
-        chunks = self._inbox.chunks(tk, [row.position for row in batch.rows])
+        chunks = self._store.chunks(tk, [row.place for row in batch.rows])
         return self._ledger.calldata("setData", tk, batch.first, batch.tail, chunks)
 
     def _signed(self, tk: bytes, account: Account, nonce: int, batch: Batch) -> bytes:
@@ -431,17 +431,18 @@ class Submitter:
     # ------------------------------------------------------------------ money
 
     def _top_up(self, work: Sequence[Work], nonces: tuple[int, int], now: float) -> None:
-        """allocETH for accounts that have work and less than low water, or than what is in flight may cost; nothing
-        while the operator's last transactions are in no block.
+        """allocETH for accounts with less than low water, or than what is in flight may cost (elsewhere: one batch),
+        here only where there is work; nothing while the operator's last transactions are in no block.
         """
         funds, (latest, pending) = self._funds, nonces
         if funds.nonce != latest:
             funds.nonce, funds.since = latest, now
-        poor = []
+        enough = max(self._settings.low_water, BATCH_GAS * self._fees.highest)
+        poor = [s for s in self._paid if s.account and not s.revoked and s.balance < min(enough, _MOST)]
         for w in work:
             account = self._known[w.tk]
             cost = sum(batch.gas for batch in account.flights) * (account.fees or self._fees).highest
-            if w.standing.balance < min(max(self._settings.low_water, cost), contract.BALANCE_LIMIT // 2):
+            if w.standing.balance < min(max(self._settings.low_water, cost), _MOST):
                 poor.append(w.standing)
         if not poor:
             self.funds = None
@@ -451,7 +452,7 @@ class Submitter:
         funds.fees = self._fees.at_least(funds.fees.raised()) if stuck and funds.fees else self._fees
         funds.since = now
         self.operator_balance = left = self._ledger.balance(self._operator.address)
-        self.funds, raws = None, list[bytes]()
+        self.funds, raws, paid = None, list[bytes](), list[Standing]()
         for standing in sorted(poor, key=lambda standing: standing.balance)[:TOP_UPS]:
             data = self._ledger.calldata("allocETH", standing.account)
             wei = min(self._settings.top_up, contract.BALANCE_LIMIT - standing.balance)
@@ -461,11 +462,14 @@ class Submitter:
                 break
             nonce, gas = latest + len(raws), contract.call_gas(data)
             raws.append(self._ledger.sign(self._operator, data, nonce=nonce, gas=gas, fees=funds.fees, value=wei).raw)
-        for error in self._ledger.send(raws):
+            paid.append(standing)
+        for standing, error in zip(paid, self._ledger.send(raws), strict=True):
             if error is None:
                 self.counts["top-ups"] += 1
             elif not isinstance(error, AlreadyKnown):
                 self.funds = str(error)
+                continue
+            self._paid = [other for other in self._paid if other.account != standing.account]
 
 
 def _cut(first: int, tail: bytes, rows: Sequence[Row], most: int) -> Batch:

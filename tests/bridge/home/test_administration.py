@@ -1,4 +1,4 @@
-"""The operator's work on a home, an embedded chain and an inbox: who may write when, and what a crash leaves."""
+"""The operator's work on a home, an embedded chain and a store: who may write when, and what a crash leaves."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from rosbridge_eth.config import Address, load_reader_config, load_server_config
 from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
-from rosbridge_eth.inbox import open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable
+from rosbridge_eth.log.opening import open_store
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import join, needs_password, read_bundle
 from rosbridge_eth.operator.registry import Registry
@@ -70,7 +70,7 @@ def test_without_a_default_route_another_interface_is_found_and_last_the_loopbac
 
 @pytest.mark.parametrize("change", [
     {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"}, {"server": "My Server"},
-    {"chain_url": 'http://x"\nworkers = 3\n#'},
+    {"chain_url": 'http://x"\nshards = 3\n#'},
 ])
 def test_what_cannot_be_a_configuration_is_refused_before_anything_is_made(
     change: dict[str, str], tmp_path: Path
@@ -204,7 +204,7 @@ def test_a_backup_of_a_home_in_use_is_a_home(world: World, tmp_path: Path) -> No
     world.hand_over(2)
     admin.backup(world.home.path, tmp_path / "copy")
     copy = OperatorHome(tmp_path / "copy").require()
-    assert (copy.path / "inbox.sqlite").stat().st_mode & 0o777 == 0o600
+    assert (copy.path / "store-0.sqlite").stat().st_mode & 0o777 == 0o600
     with registry_of(copy) as known:
         assert [*known.robots()] == [TK]
     assert load_ca(copy.ca, PASSPHRASE, NOW)
@@ -368,7 +368,7 @@ def test_a_robot_with_its_own_keys_is_registered_and_nothing_secret_is_in_its_bu
     assert world.ledger.balance(made.account) == 5 * 10**17
     with registry(world) as known:
         assert known.robots()[TK].hash == standing.certificates_hash and known.allows(peer)
-    assert robot.bridge().server_address == "127.0.0.1:7410" and robot.bridge().ledger == world.ledger.ledger
+    assert robot.bridge().servers == ["127.0.0.1:7410"] and robot.bridge().ledger == world.ledger.ledger
 
 
 def test_easy_register_makes_the_keys_and_seals_them_under_the_password(world: World) -> None:
@@ -447,7 +447,7 @@ def test_a_compromised_robot_is_replaced_at_once_and_what_it_handed_over_is_neve
     world.write(1)
     new = world.register(replace=True, compromised=True)
     assert new.buried == 3 and world.written() == [(old.account, 1)]
-    assert [(letter.tk, letter.why) for letter in world.inbox.dead()] == [(TK, "robot_1 was replaced")] * 3
+    assert [(letter.tk, letter.why) for letter in world.store.dead()] == [(TK, "robot_1 was replaced")] * 3
     assert sum(float(event.split()[1]) for event in world.events) == admin.HANDING_OVER
     world.write(9)
     assert world.written() == [(old.account, 1)]
@@ -479,7 +479,7 @@ def test_without_a_server_a_robot_is_revoked_all_the_same_and_the_rest_becomes_d
     at = world.now
     assert world.revoke(compromised=compromised).buried == 3
     assert (world.now - at < 3) == compromised
-    assert world.ledger.standings([TK])[0].revoked and world.inbox.totals().get(TK, (0,))[0] == 0
+    assert world.ledger.standings([TK])[0].revoked and world.store.waiting(TK).chunks == 0
     assert world.written() == []
 
 
@@ -497,7 +497,7 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
             with pytest.raises(ChainError, match=r"half done: .* run `revoke robot_1` again"):
                 world.revoke()
     with monkeypatch.context() as patched:
-        patched.setattr(world, "open_inbox", partial(open_inbox, "redis://127.0.0.1:9", home=world.home.path,
+        patched.setattr(world, "open_store", partial(open_store, "redis://127.0.0.1:9", file=world.home.path,
                                                      ledger=bytes(32), max_bytes=1, max_bytes_per_robot=1))
         with pytest.raises(StoreError, match=r"half done: .* run `revoke robot_1` again"):
             world.revoke()
@@ -514,7 +514,7 @@ def test_what_came_after_a_revocation_is_buried_by_revoking_again(world: World) 
     assert world.revoke().buried == 0
     world.hand_over(3)
     assert world.revoke() == admin.Revoked(None, 3)
-    assert len(world.inbox.dead()) == 3 and world.inbox.totals()[TK].chunks == 0
+    assert len(world.store.dead()) == 3 and world.store.waiting(TK).chunks == 0
     with pytest.raises(IdentityError, match="'robot_1' was revoked already"):
         world.revoke()
 
@@ -571,7 +571,7 @@ def test_a_crash_between_any_two_steps_is_mended_by_doing_it_again(
     with registry(world) as known:
         assert known.allows(peer) and known.robots()[TK].hash == standing.certificates_hash
     assert standing.account == new.account != old.account and not standing.revoked
-    assert world.written() == [] and len(world.inbox.dead()) == 2
+    assert world.written() == [] and len(world.store.dead()) == 2
 
 
 def test_a_treasury_that_is_empty_registers_and_says_that_there_is_no_eth_yet(

@@ -1,4 +1,4 @@
-"""A home on an embedded chain, with the inbox that workers would fill and what a submitter would write of it."""
+"""A home on an embedded chain, with the store that the server would fill and what a submitter would write of it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Any
 
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Role, load_ca
-from rosbridge_eth.inbox import Inbox, open_inbox
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id, seal
+from rosbridge_eth.log.opening import open_store
+from rosbridge_eth.log.store import NOWHERE, Offer, Store
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import Request, ask_to_join
 from smcrypto import sm2
@@ -56,12 +57,12 @@ class World:
         shutil.copytree(made, self.path, dirs_exist_ok=True)
         self.chain.ethereum_tester.revert_to_snapshot(snapshot)
         self.ledger = Ledger.connect(self.chain, self.home.deployment())
-        self.inbox = self.open_inbox()
-        self.number = 0
+        self.store = self.open_store()
+        self.number = self.streams = 0
 
-    def open_inbox(self) -> Inbox:
-        return open_inbox(
-            "sqlite", home=self.home.path, ledger=self.ledger.ledger, max_bytes=2**28, max_bytes_per_robot=2**26
+    def open_store(self) -> Store:
+        return open_store(
+            "sqlite", file=self.home.store(0), ledger=self.ledger.ledger, max_bytes=2**28, max_bytes_per_robot=2**26
         )
 
     def request(self, name: str = "robot_1") -> Request:
@@ -72,12 +73,12 @@ class World:
         options = {"request": None if "password" in options else self.request(name)} | options
         return admin.register_robot(
             self.home, name, ca=load_ca(self.home.ca, PASSPHRASE, NOW), keys=self.keys, ledger=self.ledger,
-            inbox=self.open_inbox, now=NOW, pause=self.pause, **options,
+            inbox=self.open_store, now=NOW, pause=self.pause, **options,
         )
 
     def revoke(self, name: str = "robot_1", role: Role = Role.ROBOT, **options: Any) -> admin.Revoked:
         return admin.revoke(
-            self.home, role, name, keys=self.keys, ledger=self.ledger, inbox=self.open_inbox, now=NOW,
+            self.home, role, name, keys=self.keys, ledger=self.ledger, inbox=self.open_store, now=NOW,
             pause=self.pause, **options,
         )
 
@@ -88,9 +89,10 @@ class World:
             self.write()
 
     def hand_over(self, count: int) -> list[Chunk]:
-        """The robot's next chunks of a new stream reach the inbox."""
-        log, previous, stream = Log(self.ledger.ledger, TK), bytes(32), bytes([count]) * 16
-        chunks = []
+        """The robot's next chunks of a new stream reach the store."""
+        self.streams += 1
+        log, previous, stream = Log(self.ledger.ledger, TK), bytes(32), self.streams.to_bytes(16, "big")
+        chunks, [state] = [], self.store.states([TK])
         for number in range(count):
             chunk = seal(
                 log, KEY, [b"{}"], stream=stream, number=number, previous=previous, sealed_ms=1,
@@ -98,20 +100,21 @@ class World:
             )
             previous = chunk.header.digest
             chunks.append(chunk)
-        self.inbox.append([(TK, chunk) for chunk in chunks], self.now)
+        offers = [Offer(TK, chunk, b"" if chunk.header.number else state.digest) for chunk in chunks]
+        self.store.append(offers, self.now)
         return chunks
 
     def write(self, limit: int = 1, *, confirm: bool = True) -> None:
         """What the submitter does: the next chunks go onto the chain from the robot's account, and are confirmed."""
         [standing] = self.ledger.standings([TK])
-        tail = self.inbox.find(TK, standing.tail)
-        rows = self.inbox.rows(TK, tail, limit)
+        tail = self.store.find(TK, standing.tail)
+        rows = self.store.rows(TK, tail or NOWHERE, limit)
         if rows:
             number = next(n for n in range(1, 100) if self.keys.robot(n).address == standing.account)
-            chunks = self.inbox.chunks(TK, [row.position for row in rows])
+            chunks = self.store.chunks(TK, [row.place for row in rows])
             self.ledger.set_data(self.keys.robot(number), TK, chunks)
             if confirm:
-                self.inbox.confirm(TK, rows[-1].position, self.now)
+                self.store.set_state(TK, confirmed=rows[-1].place)
 
     def written(self) -> list[tuple[str, int]]:
         """(account, chunks) of each batch on the chain."""

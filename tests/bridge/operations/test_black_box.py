@@ -22,6 +22,8 @@ from rosbridge_eth.cli import run
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.errors import ConfigError, ExitCode
+from rosbridge_eth.log.chunk import Chunk
+from rosbridge_eth.log.store import NOWHERE
 from rosbridge_eth.robot.loop import Robot, open_robot
 from rosbridge_eth.server import metrics
 
@@ -112,7 +114,7 @@ def test_an_event_after_the_end_of_a_bag_is_written_while_the_robot_waits_for_it
     def on_turn() -> None:
         if running._unspooled or running.chunks == 0 or not running._source_ended.is_set() or running._ring:
             return
-        chunks = running.spool.following(running.writer.stream, None, 1 << 30)
+        chunks = [Chunk.parse(running.spool.chunks([row.place])[0]) for row in running.spool.rows(NOWHERE, 10_000)]
         if chunks and chunks[-1].header.goodbye:
             streams.add(chunks[-1].header.stream)
             if len(streams) == 2:
@@ -195,10 +197,8 @@ def running(home: RobotHome, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def fired(home: RobotHome) -> dict[str, float]:
-    try:
-        return {of["trigger"]: value for name, of, value in metrics.figures(home.path) if name == "trigger_fired"}
-    except ValueError:
-        return {}
+    figures = metrics.running(home.path).get("robot") or []
+    return {of["trigger"]: value for name, of, value in figures if name == "trigger_fired"}
 
 
 def test_a_signal_and_the_command_are_events(
@@ -256,12 +256,14 @@ def test_a_trigger_that_is_gone_after_a_reload_has_no_figures(robot: RobotHome):
     topics = 'topics = [{topic = "/robot_1/odom", trigger = "crash"}, {topic = "/robot_1/imu", trigger = "NAME"}]\n'
     robot.config.write_text(f'{topics.replace("NAME", "fall")}{one}[[trigger]]\nname = "fall"\n')
     made = open_robot(robot, load_robot_config(robot.config), PASSWORD)
-    with closing(made.spool), closing(made.loop), metrics.shared(robot.path):
+    with closing(made.spool), closing(made.loop):
         metrics.show_robot("robot_1", made, 1.0)
         robot.config.write_text(topics.replace("NAME", "crash") + one)
         made.take_up(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
         metrics.show_robot("robot_1", made, 2.0)
-        named = {labels["trigger"] for _, labels, _ in metrics.figures(robot.path) if "trigger" in labels}
+        metrics.save(metrics.file_of(robot.path, "robot"))
+        figures = metrics.running(robot.path)["robot"] or []
+        named = {labels["trigger"] for _, labels, _ in figures if "trigger" in labels}
     assert named == {"crash"}, "`trigger` asks for those that there are"
 
 

@@ -29,6 +29,7 @@ from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
+from rosbridge_eth.log import store
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.operator import doctor as checks
 from rosbridge_eth.operator import enrolment as admin
@@ -151,7 +152,7 @@ ODOM = 'topics = ["/robot_1/odom"]\n'
     ("operator", lambda p: (p / "operator/server.toml").write_text("listen = 1"), "configuration", ""),
     ("operator", lambda p: (p / "operator/registry.sqlite").write_bytes(b"no database" * 999), "registry", "backup"),
     ("operator", lambda p: (p / "pass").write_bytes(b"another"), "passphrase", ""),
-    ("operator", lambda p: (p / "operator/inbox.sqlite").write_bytes(b"no database" * 999), "store", ""),
+    ("operator", lambda p: (p / "operator/store-0.sqlite").write_bytes(b"no database" * 999), "store", ""),
     ("reader", lambda p: (p / "readers").write_bytes(b"another"), "keys", ""),
     ("reader", lambda p: (p / "reader/reader.toml").write_text("x = 1"), "node", ""),
 ])
@@ -284,7 +285,7 @@ class Stranger(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b'{"conditions": 3}', b"\xff", b'{"conditions": {}}'])
+@pytest.mark.parametrize("answer", [b"", b"<html>", b"[]", b"up 1\n", b"\xff", b"up\n", b"a{b"])
 def test_another_web_server_in_the_monitors_place_is_broken(
     place: Place, server: Address, answer: bytes, capsys: Capture
 ):
@@ -312,7 +313,7 @@ def test_a_server_without_its_monitor_is_broken_and_one_that_is_not_ready_too(
     place.configure("\n[chain]", f'monitor = "127.0.0.1:{free}"\n[chain]')
     _, findings = doctor(capsys)
     assert "not answered" in of(findings, "monitor port")["found"]
-    answer = json.dumps({"ok": False, "conditions": {"node answers": False, "worker-0 runs": True}}).encode()
+    answer = b'rosbridge_eth_condition{process="shard-0",name="node answers"} 0.0\n'
     http = HTTPServer(("127.0.0.1", free), type("Answer", (Stranger,), {"answer": answer}))
     thread = threading.Thread(target=http.serve_forever, args=(0.05,))
     thread.start()
@@ -385,7 +386,7 @@ def test_an_address_that_is_none_is_found_at_both_ends(place: Place, capsys: Cap
     _, findings = doctor(capsys)
     assert any("public =" in f["found"] + f["mend"] for f in findings if f["result"] == "broken")
     end = place.robot.bridge()
-    place.robot.save_bridge(replace(end, server_address="0.0.0.0:7410"))
+    place.robot.save_bridge(replace(end, servers=["0.0.0.0:7410"]))
     _, findings = doctor(capsys, "--home", "robot")
     assert of(findings, "bridge")["result"] == "broken" and "robot.toml" in of(findings, "bridge")["mend"]
     place.robot.config.write_text(f'server = "192.0.2.1:7410"\n{ODOM}')
@@ -454,7 +455,7 @@ def test_another_chain_with_the_same_id_has_its_mend(place: Place, keys: Keyring
 
 def test_what_waits_is_told(place: Place, capsys: Capture):
     inbox, tk = place.inbox(), robot_id("robot_1")
-    inbox.append([(tk, chunk) for chunk in chunk_chain(3)], time.time())
+    inbox.append([store.Offer(tk, chunk) for chunk in chunk_chain(3)], time.time())
     inbox.close()
     _, findings = doctor(capsys)
     assert of(findings, "store")["found"] == "3 chunks wait"
@@ -467,11 +468,11 @@ def test_a_redis_that_may_lose_chunks_or_gives_too_few_rights_is_broken(place: P
     try:
         place.configure("\n[chain]", f'\n[store]\nurl = "{redis.url}"\n[chain]')
         _, findings = doctor(capsys)
-        assert of(findings, "store")["result"] == "ok" and "none yet" in of(findings, "store")["found"]
+        assert of(findings, "store")["result"] == "ok" and of(findings, "store")["found"] == "0 chunks wait"
         with redis.client() as client:
             assert client.keys() == [], "doctor makes nothing"
-            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all", "-xtrim"])
-            assert "+xtrim" in json.dumps(of(doctor(capsys)[1], "store")), "rights are tried before there is an inbox"
+            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all", "-hget"])
+            assert "+hget" in json.dumps(of(doctor(capsys)[1], "store")), "rights are tried before there is an inbox"
             client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all"])
             place.inbox().close()
             assert of(doctor(capsys)[1], "store")["result"] == "ok"
@@ -479,9 +480,9 @@ def test_a_redis_that_may_lose_chunks_or_gives_too_few_rights_is_broken(place: P
             _, findings = doctor(capsys)
             assert "CONFIG SET appendfsync always" in json.dumps(of(findings, "store"))
             client.config_set("appendfsync", "always")
-            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all", "-xrange"])
+            client.acl_setuser("default", enabled=True, nopass=True, keys=["*"], commands=["+@all", "-zadd"])
             _, findings = doctor(capsys)
-            assert of(findings, "store")["result"] == "broken" and "+xrange" in json.dumps(of(findings, "store"))
+            assert of(findings, "store")["result"] == "broken" and "+zadd" in json.dumps(of(findings, "store"))
     finally:
         redis.kill()
 

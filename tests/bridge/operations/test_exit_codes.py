@@ -21,6 +21,7 @@ from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log import chunk
 from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.log.store import NOWHERE, Offer
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from smcrypto import sm2
 
@@ -45,14 +46,14 @@ def as_it_is(place: Place, keys: Keyring) -> None:
 
 def waiting(place: Place, keys: Keyring) -> None:
     inbox = place.inbox()
-    inbox.append([(TK, one) for one in chunk_chain(1)], time.time())
+    inbox.append([Offer(TK, one) for one in chunk_chain(1)], time.time())
     inbox.close()
 
 
 def dead(place: Place, keys: Keyring) -> None:
     waiting(place, keys)
     inbox = place.inbox()
-    inbox.bury(TK, None, "given up")
+    inbox.remove(TK, [row.place for row in inbox.rows(TK, NOWHERE, 9)], "given up")
     inbox.close()
 
 
@@ -108,12 +109,12 @@ from pathlib import Path
 from rosbridge_eth.server import metrics
 from rosbridge_eth.config.home import RobotHome
 place = RobotHome(Path("robot"))
-with metrics.shared(place.path):
-    metrics.FIRED.labels("robot_1", "crash").set(0)
-    print("up", flush=True)
-    while not place.event("crash").exists():
-        time.sleep(0.02)
-    place.event("crash").unlink()
+metrics.FIRED.labels("robot_1", "crash").set(0)
+metrics.save(metrics.file_of(place.path, "robot"))
+print("up", flush=True)
+while not place.event("crash").exists():
+    time.sleep(0.02)
+place.event("crash").unlink()
 """
     running = subprocess.Popen([sys.executable, "-c", program], cwd=place.path, stdout=subprocess.PIPE)
     assert running.stdout is not None and running.stdout.readline() == b"up\n"

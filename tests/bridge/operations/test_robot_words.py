@@ -73,7 +73,7 @@ def test_the_picture_does_not_count_what_was_refused_among_what_waits_for_the_ch
     with closing(robot.spool), closing(robot.loop):
         for chunk in robot.writer.finish(0):
             robot.spool.append(chunk)
-            robot.spool.set_aside(robot.writer.stream, chunk.header.number)
+            robot.spool.set_aside(chunk.header.digest)
         shown = Console(width=200, file=(out := io.StringIO()))
         shown.print(_picture("robot_1", robot, metrics.Rates()))
         assert "0 wait for the server, 0 for the chain, 0 confirmed" in out.getvalue()
@@ -87,7 +87,7 @@ def test_a_disk_that_is_full_when_a_session_begins_does_not_end_a_robot(tmp_path
         with closing(robot.spool), closing(robot.loop):
             ballast = disks.fill_up(disk)
             robot.handle(Connected(READER.public, bytes(8), NOW))
-            assert robot.sender.statistics.connected and "cannot be kept" in caplog.text
+            assert robot.sender.connected and "cannot be kept" in caplog.text
             ballast.unlink()
             robot.handle(Connected(READER.public, bytes(8), NOW))
             assert home.clock_floor() == pytest.approx(NOW.timestamp(), abs=1)
@@ -111,7 +111,7 @@ def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
     with Registry(place.operator.registry) as registry:
         registry.revoke("robot", "robot_1", datetime.now(UTC))
     robot = opened(place, place.robot.config.read_text())
-    robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal and robot.chunks else None)
+    robot.run(on_turn=lambda: robot.stop() if robot.sender.refusal and robot.chunks else None)
     for text in (robot.summary, " ".join(warnings(caplog))):
         assert "register --replace" in text
     assert re.search(r"[1-9]\d* chunks not yet at the server", robot.summary)
@@ -121,7 +121,7 @@ def test_a_mode_that_the_server_may_not_take_is_named(
     place: Place, server: Address, impatient: None, caplog: Logged
 ) -> None:
     robot = opened(place, 'channel = "transport"\n' + place.robot.config.read_text())
-    robot.run(on_turn=lambda: robot.stop() if robot.sender.statistics.refusal else None)
+    robot.run(on_turn=lambda: robot.stop() if robot.sender.refusal else None)
     [said] = warnings(caplog)
     assert 'channel = "transport"' in said
 
@@ -135,14 +135,14 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
     monkeypatch.setattr(socket, "getaddrinfo", away)
     robot = opened(place, f'server = "robots.example:7410"\n{ODOM}{BAG}')
     captured = robot.source.message_count  # type: ignore[attr-defined]
-    with metrics.shared(place.robot.path):
-        def on_turn() -> None:
-            metrics.show_robot("robot_1", robot, 0.0)
-            if robot.captured == captured and robot.sender.statistics.refusal:
-                robot.stop()
 
-        robot.run(on_turn=on_turn)
-        assert not metrics.conditions(metrics.collected(place.robot.path), (), 0.0)["server's name has an address"]
+    def on_turn() -> None:
+        metrics.show_robot("robot_1", robot, 0.0)
+        if robot.captured == captured and robot.sender.refusal:
+            robot.stop()
+
+    robot.run(on_turn=on_turn)
+    assert metrics.CONDITION.labels("robot", "server's name has an address")._value.get() == 0
     [said] = warnings(caplog)
     why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
     assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary
