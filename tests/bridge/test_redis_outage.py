@@ -110,8 +110,8 @@ def test_a_redis_that_is_away_makes_robots_hold_and_its_return_is_told(site: Sit
     assert any("store" in why for why in held)
     redis_server.start()
     site.finish()
-    faults.until("its return is told", lambda: site.said("the store: well again") >= 1)
-    assert site.said("server: the store: ") > site.said("the store: well again") >= 1
+    faults.until("its return is told", lambda: site.said("the store: works again") >= 1)
+    assert site.said("server: the store: ") > site.said("the store: works again") >= 1
 
 
 @pytest.mark.service

@@ -106,7 +106,7 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
     assert len(set(seen)) == 1 and seen[0] < 3 * RING, "nothing more is captured while nothing can be kept"
     assert robot.captured == 3 * RING
     assert "the spool: the disk is full" in caplog.text
-    assert "the spool: well again" in caplog.text
+    assert "the spool: works again" in caplog.text
     assert f"{robot.chunks} chunks not yet at the server" in robot.summary
 
 
@@ -159,7 +159,7 @@ def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_
                 robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: well again"]
+    assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: works again"]
 
 
 def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(

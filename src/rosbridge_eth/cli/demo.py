@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from html import escape
@@ -27,13 +27,12 @@ from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
-from rosbridge_eth.logs import log_to_stderr
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
-from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.sources import sample_bag
 from rosbridge_eth.robot.topics import robot_toml
-from rosbridge_eth.terminal import data, errors, table, talk
+from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.cli.relay import Harm
@@ -247,31 +246,20 @@ def demo(
 
     Exits with 9 if a single record is missing, altered or doubled.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from rosbridge_eth.cli.relay import Harm
     from rosbridge_eth.reading import outputs
 
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
-    columns = (TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with ExitStack() as stack:
-        progress = stack.enter_context(Progress(*columns, console=errors))
-        home = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosbridge-eth-"))
-        with closing(BagSource(chosen, Selection(topics))) as opened:
-            total = opened.message_count
-        names = {"captured": "records captured", "stored": "lines stored", "verified": "records verified"}
-        bars = {stage: progress.add_task(name, total=total) for stage, name in names.items()}
+    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
         def show(stages: Stages) -> None:
-            for name, bar in bars.items():
-                done = getattr(stages, name)
-                progress.update(bar, completed=done, total=max(total, done))  # more lines than records: types have some
+            progress.update(f"{stages.captured} records captured, {stages.stored} lines stored by the server")
 
         result = run_demo(
             Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
-            on_stage=lambda text: progress.console.print(f"· {text}"), on_progress=show,
+            on_stage=lambda text: errors.print(f"· {text}"), on_progress=show,
         )
     (report / "records.jsonl").write_text("".join(map(outputs.json_line, result.records)), encoding="utf-8")
     trajectory = outputs.Trajectory()

@@ -21,11 +21,20 @@ from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
 from rosbridge_eth.log.chunk import robot_id
-from rosbridge_eth.logs import LogFormat, log_to_stderr
 from rosbridge_eth.operator import status
 from rosbridge_eth.operator.bundle import Request
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
+from rosbridge_eth.terminal import (
+    OPERATOR_HOME,
+    READER_HOME,
+    LogFormat,
+    OperatorHomeOption,
+    PassphraseFile,
+    live,
+    log_to_stderr,
+    talk,
+    utc_now,
+)
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Keyring, Ledger

@@ -27,12 +27,11 @@ from rosbridge_eth.config.passphrases import read_passphrase, warn_if_others_rea
 from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.identity import check_name
 from rosbridge_eth.log.chunk import STREAM_SIZE
-from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
 from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.robot.sources import Offer, Selection
 from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
-from rosbridge_eth.terminal import errors, live, plain, table, talk
+from rosbridge_eth.terminal import LogFormat, errors, live, log_to_stderr, one_line, plain, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.robot.loop import Robot

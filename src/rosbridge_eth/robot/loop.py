@@ -32,11 +32,11 @@ from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
 from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
 from rosbridge_eth.robot.spool import Spool
+from rosbridge_eth.terminal import Trouble
 from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)
@@ -298,7 +298,7 @@ class Robot:
     def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
         """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
 
-        A spool may do one thing and not another: it is well again when all that it did not do is done.
+        A spool may do one thing and not another: it works again when all that it did not do is done.
         """
         try:
             given = call()

@@ -26,13 +26,13 @@ from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.log import opening
 from rosbridge_eth.log.store import Store
-from rosbridge_eth.logs import Trouble
 from rosbridge_eth.operator.enrolment import server_trust
 from rosbridge_eth.operator.registry import Enrolment, Registry
 from rosbridge_eth.server import metrics
 from rosbridge_eth.server.reception import Reception, Worker
 from rosbridge_eth.server.submitter import Settings as SubmitterSettings
 from rosbridge_eth.server.submitter import Submitter
+from rosbridge_eth.terminal import Trouble
 
 if TYPE_CHECKING:
     from eth_account.signers.local import LocalAccount

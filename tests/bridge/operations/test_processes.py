@@ -252,7 +252,7 @@ def test_a_node_that_is_away_is_told_and_so_is_its_return(bridge: Bridge):
     assert report["node"] is None
     bridge.start_anvil()
     bridge.until("ready again", bridge.ready)
-    bridge.until("said so", lambda: bridge.said("server.log", "the node: well again") == 2)
+    bridge.until("said so", lambda: bridge.said("server.log", "the node: works again") == 2)
     assert bridge.said("server.log", "the node: http://127.0.0.1") >= 2
 
 
