@@ -25,7 +25,8 @@ CHUNK = parsers.chunks.seal(
 PLACE, DIGEST = bytes(range(24)), bytes(range(32))
 INPUTS = [
     CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, parsers.chunks._compressed(b"one\ntwo\n", 3) + bytes(20),
-    parsers.chunks._compressed(b"one\n" + b"a" * 70_000 + b"\n", 3), encode_offer(CHUNK.encoded), encode_offer(CHUNK.encoded, DIGEST),
+    parsers.chunks._compressed(b"one\n" + b"a" * 70_000 + b"\n", 3), encode_offer(CHUNK.encoded),
+    encode_offer(CHUNK.encoded, DIGEST),
     ServerState().encode(), ServerState(PLACE, DIGEST, PLACE, 2, 255, DIGEST, "größer").encode(),
 ]  # fmt: skip
 
