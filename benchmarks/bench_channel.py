@@ -22,7 +22,7 @@ from pathlib import Path
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message, Mode, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
 from rosbridge_eth.channel.wire import HELLO_PADDING, SEGMENT_SIZE, Hello, Kind
 from smcrypto import sm3, sm4
 
@@ -107,7 +107,7 @@ def carried(size: int, count: int) -> tuple[float, float]:
 def loopback(megabytes: float) -> None:
     """Two processes, one socket each."""
     count = int(megabytes * 1e6 / CHUNK)
-    [listening] = server_sockets(("127.0.0.1", 0))
+    listening = server_socket(("127.0.0.1", 0))
     sock, address = client_socket(listening.getsockname()[:2])
     server, client = make_server(time.monotonic()), make_client(time.monotonic())
     child = os.fork()

@@ -39,7 +39,7 @@ from eth_hash.auto import keccak
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
@@ -226,7 +226,7 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
 
     Records a second, records in a chunk, and lines in the store: the records, and those that open the stream.
     """
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     port = sock.getsockname()[1]
     context = multiprocessing.get_context("fork")
     stop = context.Event()
@@ -244,7 +244,7 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     robot = Robot(
         source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
         writer=writer, spool=spool, client=client, sender=sender,
-        server=Address("127.0.0.1", port),
+        servers=[Address("127.0.0.1", port)],
     )  # fmt: skip
     started = time.perf_counter()
     robot.run()

@@ -2,7 +2,7 @@
 
     python benchmarks/faults.py [--fault NAME ...] [--seed N] [--rounds N] [--json FILE]
 
-A node (anvil), a server with two workers and robots are started as an operator
+A node (anvil), a server and robots are started as an operator
 starts them, by `python -m rosbridge_eth`. Each robot replays the first 100
 Odometry messages of the sample bag, so what it says is known. While they flow, at moments
 drawn from the seed, something is killed, filled, cut or confused. Then the
@@ -54,7 +54,7 @@ from rosbridge_eth.log.chunk import Chunk, Header, robot_id
 from rosbridge_eth.reading import Kind, ProvenRecord, Verdict, read_robot
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
-from rosbridge_eth.server.supervisor import open_store
+from rosbridge_eth.server.shard import open_store
 
 TOPIC = "/robot_1/odom"
 MESSAGES, PACE = 100, 5  # times as fast as recorded
@@ -306,7 +306,7 @@ class Site:
     def start_server(self, **environment: str) -> None:
         self.server = server = Program(
             self.folder / "server.log",
-            ["server", "--workers", "2", "--verbose", *self._passphrase], environment,
+            ["server", "--verbose", *self._passphrase], environment,
         )
         until("the server listens", lambda: "Listening on" in server.said or server.ended())
         assert not server.ended(), server.said[-3000:]
@@ -566,26 +566,14 @@ def kill_robot(site: Site, seed: int) -> Count:
     return flow.audit()
 
 
-def kill_worker(site: Site, seed: int) -> Count:
-    """kill -9 of both workers, one after the other."""
-    flow = Flow(site, "worker killed", seed)
-    flow.start()
-    for name in flow.random.sample(["worker-0", "worker-1"], 2):
-        flow.pause(0.1, 0.4)
-        kill(site.child(name))
-        flow.event(f"kill -9 {name}")
-    flow.finish()
-    return flow.audit()
-
-
-def kill_submitter(site: Site, seed: int) -> Count:
-    """kill -9 of the submitter, between any two of its writes."""
-    flow = Flow(site, "submitter killed", seed)
+def kill_shard(site: Site, seed: int) -> Count:
+    """kill -9 of the shard, with its submitter between any two of its writes; twice."""
+    flow = Flow(site, "shard killed", seed)
     flow.start()
     for _ in range(2):
-        flow.pause(0.2, 0.5)
-        kill(site.child("submitter"))
-        flow.event("kill -9 submitter")
+        flow.pause(0.1, 0.5)
+        kill(site.child("shard-0"))
+        flow.event("kill -9 shard-0")
     flow.finish()
     return flow.audit()
 
@@ -649,10 +637,10 @@ def bad_network(site: Site, seed: int) -> Count:
 
 
 def everything(site: Site, seed: int) -> Count:
-    """A bad network, and on it a robot, a worker and the submitter killed in an order that the seed chose."""
+    """A bad network, and on it a robot and the shard, twice, killed in an order that the seed chose."""
     flow = Flow(site, "several at once", seed, harm=BAD_NETWORK)
     program = flow.start()
-    for victim in flow.random.sample(["worker-0", "worker-1", "submitter", "robot"], 4):
+    for victim in flow.random.sample(["shard-0", "shard-0", "robot"], 3):
         flow.pause(0.05, 0.3)
         flow.event(f"kill -9 {victim}")
         if victim == "robot":
@@ -698,16 +686,14 @@ def full_disk_of_robot(site: Site, seed: int) -> Count:
         flow = Flow(site, "robot's disk full", seed, home=disk / "robot")
         program = flow.start()
         flow.pause(0.05, 0.3)
-        workers = [site.child("worker-0"), site.child("worker-1")]
-        for pid in workers:
-            os.kill(pid, signal.SIGSTOP)
+        shard = site.child("shard-0")
+        os.kill(shard, signal.SIGSTOP)
         try:
             ballast = fill_up(disk)
             flow.event("the disk of the spool is full, and the server does not answer")
             flow.pause(0.3, 0.5)
         finally:
-            for pid in workers:
-                os.kill(pid, signal.SIGCONT)
+            os.kill(shard, signal.SIGCONT)
         flow.pause(0.1, 0.3)
         ballast.unlink()
         flow.finish(program)
@@ -794,8 +780,7 @@ def twins(site: Site, seed: int) -> Count:
 
 FAULTS: dict[str, Callable[[Site, int], Count]] = {
     "robot": kill_robot,
-    "worker": kill_worker,
-    "submitter": kill_submitter,
+    "shard": kill_shard,
     "server": kill_server,
     "node": kill_node,
     "network": bad_network,

@@ -1,7 +1,7 @@
 """Many robots at once: from their handshakes to the chain, each stage counted and timed.
 
     python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--per-chunk 1]
-                              [--store sqlite|redis|URL] [--chain anvil|embedded|clique] [--workers 2] [--json FILE]
+                              [--store sqlite|redis|URL] [--chain anvil|embedded|clique] [--shards 1] [--json FILE]
 
 The paper's blockchain end received 2,994, 4,986 and 6,991 messages of 300, 500
 and 700 clients that sent 10 each, and so lost 0.23 % (Security and
@@ -11,9 +11,8 @@ Everything is real but the robots' hardware: every session has an identity,
 certificates, an account, a registration in the contract, a spool, a socket and
 chunks of the sample bag's Odometry, sealed by the robot's writer; each message
 is a chunk of its own, as if it were the only one of its second. The sessions
-are spread over a few client processes. The server's workers share one UDP
-port, commit to the store and answer; the submitter writes to the chain, and
-the robots are told what is confirmed. At the end every robot's log is read
+are spread over a few client processes. Each shard of the server has its UDP
+port, store and submitter, and the robots are told what is confirmed. At the end every robot's log is read
 back from the chain, compared byte by byte with what was sealed, verified and
 opened with the reader's key, and its messages compared with those captured.
 
@@ -54,10 +53,9 @@ from ports import free_port
 from rosbridge_eth.capture import Capture, TopicRule, definition_line, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Drop
 from rosbridge_eth.channel.protection import Direction
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.config import load_server_config
-from rosbridge_eth.config.home import OperatorHome, ReaderHome
-from rosbridge_eth.errors import StoreError
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
+from rosbridge_eth.config import Address, load_server_config
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, shard_of
 from rosbridge_eth.identity import (
     CertificateAuthority,
     Identity,
@@ -82,7 +80,7 @@ from rosbridge_eth.robot.sources.bag import sample_bag
 from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
-from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
+from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
 from smcrypto import sm2
 
 TOPIC = "/robot_1/odom"
@@ -103,7 +101,7 @@ class Figures:
     per_chunk: int
     store: str
     chain: str
-    workers: int
+    shards: int
     load_average: float = 0.0
     established: int = 0
     sent: int = 0
@@ -129,9 +127,8 @@ class Figures:
     reconnected: int = 0
     batches: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
-    worker_mib: list[float] = field(default_factory=list)
+    shard_mib: list[float] = field(default_factory=list)
     growth_kib_per_session: float = 0.0
-    submitter_mib: float = 0.0
 
 
 # --- the operator: a home, a chain, a contract, robots
@@ -215,7 +212,6 @@ class Operator:
             where = EmbeddedChain(fund={self.keys.operator.address: RICH * 10**18})
         self._where = where
         self.deployment = deploy_contract(self.home, where, self.keys)
-        open_store(self.config, self.home).close()  # made before there are workers, as the supervisor does
         self.ledger = Ledger.connect(where, self.deployment)
         self.server = load_server_identity(self.home, self.passphrase)
         self.reader, roots = load_identity(self.reader_home.path, self.passphrase)
@@ -266,41 +262,28 @@ class Operator:
         """The contract, for one process. The embedded chain lives in the process that asks."""
         return Ledger.connect(self._where, self.deployment)
 
-    # The server's processes, made of the parts that the supervisor forks.
-
-    def work(self, number: int, sock: socket.socket, report: Connection) -> None:
-        stopped = _until_terminated()
-        opening = _time_calls(Direction, "open")
-        verifying = _time_calls(door, "verify")
-        reception = open_reception(
-            number, self.config, self.server, self.home, Registry(self.home.registry),
-            open_store(self.config, self.home), self.deployment,
-        )
-        worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
-        before = resident_kib()
-        worker.run(stopped)
-        drops = {str(what): n for what, n in reception.server.statistics().items() if isinstance(what, Drop)}
-        report.send({
-            "opening": opening, "verifying": verifying, "dropped": drops,
-            "before": before, "peak": peak_kib(),
-        })  # fmt: skip
-
-    def submit(self, report: Connection) -> None:
-        """The submitter; when it is ended, it reads back what the chain has of as many robots as it is told."""
-        stopped = _until_terminated()
-        ledger = self.connect()
+    def serve(self, shard: int, shards: int, sock: socket.socket, submitted: Any, report: Connection) -> None:
+        """A shard, as a process; when it is ended, it reads back what the chain has of those robots it is told."""
+        stopped, config = _until_terminated(), self.config.model_copy(update={"shards": shards})
+        opening, verifying, ledger = _time_calls(Direction, "open"), _time_calls(door, "verify"), self.connect()
+        registry, store = Registry(self.home.registry), open_store(config, self.home, shard)
+        reception = open_reception(config, self.server, self.home, registry, store, shard)
         submitter = open_submitter(
-            self.config, ledger, open_store(self.config, self.home), Registry(self.home.registry), self.keys
+            config, ledger, open_store(config, self.home, shard), Registry(self.home.registry), self.keys, shard
         )
-        while not stopped():
-            try:
-                wait = submitter.turn(time.time())
-            except StoreError:
-                wait = 0.25  # as the supervisor does; the store connects anew
-            time.sleep(min(wait, 0.25))
-        peak = peak_kib()
-        robots = self.robots[: report.recv()]
-        report.send({"found": [read_back(self, ledger, robot) for robot in robots], "peak": peak})
+        turning = _time_calls(submitter, "turn")
+        before = resident_kib()
+
+        def note() -> None:
+            submitted.value = turning["seconds"]
+
+        Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter).run(
+            stopped, on_turn=note
+        )
+        drops = {str(what): n for what, n in reception.server.statistics().items() if isinstance(what, Drop)}
+        served = {"opening": opening, "verifying": verifying, "dropped": drops, "before": before, "peak": peak_kib()}
+        own = [robot for robot in self.robots[: report.recv()] if shard_of(robot_id(robot.name), shards) == shard]
+        report.send(served | {"found": [read_back(self, ledger, robot) for robot in own]})
 
 
 @dataclass(frozen=True)
@@ -480,12 +463,12 @@ class Session:
 
 
 def client_process(
-    operator: Operator, robots: Sequence[Identity], server: tuple[str, int], messages: int, per_chunk: int,
+    operator: Operator, robots: Sequence[Identity], servers: Sequence[tuple[str, int]], messages: int, per_chunk: int,
     report: Connection, limit: float,
 ) -> None:
     """Several robots in one process. It reports after each phase and waits for the word to go on."""
     logging.getLogger("rosbridge_eth").setLevel(logging.ERROR)  # that a session takes long is in the figures
-    sessions = [Session(operator, robot, server) for robot in robots]
+    sessions = [Session(operator, robot, servers[shard_of(robot_id(robot.name), len(servers))]) for robot in robots]
     sealed: dict[bytes, bytes] = {}
     for session in sessions:
         sealed |= session.seal(messages, per_chunk)
@@ -561,23 +544,23 @@ def _processes() -> Iterator[Callable[..., tuple[Any, Connection]]]:
 
 
 def run(
-    operator: Operator, sessions: int, messages: int, *, per_chunk: int = 1, workers: int = 2, clients: int = 2,
+    operator: Operator, sessions: int, messages: int, *, per_chunk: int = 1, shards: int = 1, clients: int = 2,
     limit: float = 240.0, on_stage: Callable[[str], None] = lambda text: None,
 ) -> Figures:
     """One run with the first `sessions` robots of `operator`; `limit` is for each phase, in seconds."""
-    figures = Figures(sessions, messages, per_chunk, operator.store_kind, operator.chain_kind, workers)
+    figures = Figures(sessions, messages, per_chunk, operator.store_kind, operator.chain_kind, shards)
     figures.load_average, figures.sent = os.getloadavg()[0], sessions * messages
     robots = operator.robots[:sessions]
-    sockets = server_sockets(("127.0.0.1", 0), workers)
-    address = sockets[0].getsockname()[:2]
+    sockets = [server_socket(Address("127.0.0.1", 0)) for _ in range(shards)]
+    addresses, submitted = [sock.getsockname()[:2] for sock in sockets], [FORK.Value("d", 0.0) for _ in sockets]
     lines = captured(messages)[0]  # before the processes are forked, that all have the same
     with _processes() as start:
-        serving = [start(operator.work, number, sock) for number, sock in enumerate(sockets)]
-        submitter, submitter_pipe = start(operator.submit)
+        serving = [start(operator.serve, number, shards, sock, submitted[number])
+                   for number, sock in enumerate(sockets)]  # fmt: skip
         pids = [process.pid for process, _ in serving]
 
         def client(own: Sequence[Identity], pipe: Connection) -> None:
-            client_process(operator, own, address, messages, per_chunk, pipe, limit)
+            client_process(operator, own, addresses, messages, per_chunk, pipe, limit)
 
         ends = [start(client, robots[n::clients])[1] for n in range(clients)]
         on_stage(f"{sessions} robots seal {messages} messages each")
@@ -596,7 +579,7 @@ def run(
         figures.handshake_cpu_ms = (cpu_seconds(pids) - cpu) / max(1, figures.established) * 1000
 
         on_stage("messages")
-        cpu, submitted = cpu_seconds(pids), cpu_seconds([submitter.pid])
+        cpu, before = cpu_seconds(pids), sum(each.value for each in submitted)
         for pipe in ends:
             pipe.send("send")
         for pipe in ends:
@@ -604,24 +587,23 @@ def run(
         started = time.perf_counter()
         figures.stored = figures.chunks - sum(pipe.recv() for pipe in ends)
         figures.sending = time.perf_counter() - started
-        figures.message_cpu_ms = (cpu_seconds(pids) - cpu) / figures.sent * 1000
+        writing = sum(each.value for each in submitted) - before
+        figures.message_cpu_ms = (cpu_seconds(pids) - cpu - writing) / figures.sent * 1000
         on_stage("the chain")
         reports = [pipe.recv() for pipe in ends]
         figures.to_chain = time.perf_counter() - started
-        figures.submitter_cpu_ms = (cpu_seconds([submitter.pid]) - submitted) / figures.sent * 1000
+        figures.submitter_cpu_ms = (sum(each.value for each in submitted) - before) / figures.sent * 1000
         for pipe in ends:
             pipe.send("end")
-        for process, _ in serving:
-            process.terminate()
-        served = [pipe.recv() for _, pipe in serving]
         on_stage("reading back")
-        submitter.terminate()
-        submitter_pipe.send(sessions)
-        read = submitter_pipe.recv()
+        for process, pipe in serving:
+            process.terminate()
+            pipe.send(sessions)
+        served = [pipe.recv() for _, pipe in serving]
     for sock in sockets:
         sock.close()
 
-    for found in read["found"]:
+    for found in [found for one in served for found in one["found"]]:
         # The operator's chain may hold earlier runs of the same robots.
         chunks = [(Chunk.parse(chunk).header.digest, chunk) for batch in found.batches for chunk in batch]
         times = Counter(digest for digest, _ in chunks)
@@ -635,12 +617,11 @@ def run(
         figures.unsound += found.findings
         figures.batches += sum(Chunk.parse(batch[0]).header.digest in sealed for batch in found.batches)
     figures.lost = figures.chunks - figures.on_chain
-    figures.submitter_mib = read["peak"] / 1024
     for name, what in (("opened", "opening"), ("verified", "verifying")):
         setattr(figures, name, int(sum(one[what]["calls"] for one in served)))
         setattr(figures, f"{what}_ms", sum(one[what]["seconds"] for one in served) * 1000)
     figures.dropped = dict(sum((Counter(one["dropped"]) for one in served), Counter()))
-    figures.worker_mib = [one["peak"] / 1024 for one in served]
+    figures.shard_mib = [one["peak"] / 1024 for one in served]
     figures.growth_kib_per_session = sum(one["peak"] - one["before"] for one in served) / sessions
     for name in ("reconnected", "retransmitted"):
         setattr(figures, name, sum(report[name] for report in reports))
@@ -665,15 +646,14 @@ def rows(figures: Figures) -> list[tuple[str, str]]:
         ("**lost / doubled / altered**", f"**{f.lost} / {f.doubled} / {f.altered}**"),
         ("the paper: reached its server", f"{paper:,} ({(1 - paper / f.sent):.2%} lost)" if paper else "–"),
         ("messages a second into the store", f"{f.sent / f.sending:.0f}"),
-        ("server's processor time a message, workers", f"{f.message_cpu_ms:.3f} ms"),
+        ("server's processor time a message, to the store", f"{f.message_cpu_ms:.3f} ms"),
         ("of it decrypting the channel", f"{f.opening_ms / max(1, f.opened):.3f} ms a packet, {f.opening_ms:.0f} ms"),
         ("of it verifying signatures",
          f"{f.verifying_ms / max(1, f.verified):.3f} ms a chunk, {f.verifying_ms:.0f} ms"),
         ("submitter's processor time a message", f"{f.submitter_cpu_ms:.3f} ms"),
         ("first message to last confirmation at a robot", f"{f.to_chain:.1f} s, {f.batches} transactions"),
-        ("peak memory of each worker", ", ".join(f"{mib:.0f} MiB" for mib in f.worker_mib)),
+        ("peak memory of each shard", ", ".join(f"{mib:.0f} MiB" for mib in f.shard_mib)),
         ("of it a session", f"{f.growth_kib_per_session:.1f} KiB"),
-        ("peak memory of the submitter", f"{f.submitter_mib:.0f} MiB"),
         ("packets sent again / sessions made again", f"{f.retransmitted} / {f.reconnected}"),
         ("datagrams dropped by the server", ", ".join(f"{n} {why}" for why, n in f.dropped.items()) or "none"),
     ]  # fmt: skip
@@ -704,7 +684,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, nargs="+", default=[300, 500, 700])
     parser.add_argument("--messages", type=int, default=10)
     parser.add_argument("--per-chunk", type=int, default=1, help="messages in a chunk")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--shards", type=int, default=1)
     parser.add_argument("--store", default="sqlite", help="sqlite, redis (started here) or the URL of one")
     parser.add_argument("--chain", choices=["anvil", "embedded", "clique"],
                         default="anvil" if shutil.which("npx") or shutil.which("anvil") else "embedded")
@@ -721,12 +701,12 @@ def main() -> None:
         try:
             for count in options.sessions:
                 results.append(run(operator, count, options.messages, per_chunk=options.per_chunk,
-                                   workers=options.workers, on_stage=say))
+                                   shards=options.shards, on_stage=say))
         finally:
             operator.close()
     loads = ", ".join(f"{figures.load_average:.1f}" for figures in results)
     print(f"\n{processor()}, Python {platform.python_version()}, load average before each run {loads};"
-          f" {options.workers} workers, {options.chain}\n\n{table(results)}")
+          f" {options.shards} shards, {options.chain}\n\n{table(results)}")
     if options.json:
         options.json.write_text(json.dumps([asdict(figures) for figures in results], indent=1))
     for figures in results:

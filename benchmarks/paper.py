@@ -47,8 +47,8 @@ import scale
 from rosbridge_eth.log.chunk import Chunk, robot_id
 from rosbridge_eth.log.store import Offer
 from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server.shard import open_store, open_submitter
 from rosbridge_eth.server.submitter import Submitter
-from rosbridge_eth.server.supervisor import open_store, open_submitter
 
 PER_BUCKET = 100  # messages that share a point of the picture
 CONFIRMATIONS = {"poa": 3, "pow": 12}

@@ -12,8 +12,9 @@ from typing import IO
 _reserved: list[IO[bytes]] = []  # open for as long as this process lives, and locked so long
 
 
-def free_port(kind: int = socket.SOCK_STREAM) -> int:
-    """A port that no other process which asks here is given, and below those that the kernel gives out by itself.
+def free_port(kind: int = socket.SOCK_STREAM, count: int = 1) -> int:
+    """A port that no other process which asks here is given, and below those that the kernel gives out by itself; or
+    the first of so many in a row.
 
     Between the choice and its use seconds may pass: a lock on a file of the port's name keeps the processes of a
     parallel test run apart.
@@ -21,14 +22,16 @@ def free_port(kind: int = socket.SOCK_STREAM) -> int:
     folder = Path(tempfile.gettempdir()) / "rosbridge_eth-ports"
     folder.mkdir(exist_ok=True)
     while True:
-        port = random.SystemRandom().randrange(20_000, 32_000)
-        file = (folder / str(port)).open("wb")
+        first = random.SystemRandom().randrange(20_000, 32_000 - count)
+        files = [(folder / str(port)).open("wb") for port in range(first, first + count)]
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with socket.socket(socket.AF_INET, kind) as probe:
-                probe.bind(("127.0.0.1", port))
+            for port, file in enumerate(files, first):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                with socket.socket(socket.AF_INET, kind) as probe:
+                    probe.bind(("127.0.0.1", port))
         except OSError:
-            file.close()
+            for file in files:
+                file.close()
             continue
-        _reserved.append(file)
-        return port
+        _reserved.extend(files)
+        return first

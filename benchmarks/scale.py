@@ -21,7 +21,7 @@ import bridge_costs
 import load
 from rosbridge_eth.ledger.contract import set_data_gas
 from rosbridge_eth.operator.registry import Registry
-from rosbridge_eth.server.supervisor import open_store, open_submitter
+from rosbridge_eth.server.shard import open_store, open_submitter
 
 RATES = (1, 10, 100)  # messages a second of each robot
 ROBOTS = (10, 30, 100, 300, 1000, 3000, 10_000, 30_000, 100_000)

@@ -24,7 +24,7 @@ BESIDE = {".js": "JavaScript", ".mjs": "JavaScript", ".html": "JavaScript", ".lu
 """Languages that are counted beside Python, by a file's ending."""
 
 PARTS = {
-    "cli": ("__main__.py", "cli", "terminal.py", "logs.py"),
+    "cli": ("__main__.py", "cli", "terminal.py"),
     "operator, config, identity, errors": ("operator", "config", "identity.py", "errors.py", "__init__.py"),
     "capture": ("capture",),
     "log": ("log",),

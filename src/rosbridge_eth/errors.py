@@ -23,7 +23,6 @@ class ExitCode(IntEnum):
     CHAIN = 7
     SOURCE = 8
     VERIFICATION = 9
-    PROCESS = 10
 
 
 class BridgeError(Exception):
@@ -61,7 +60,3 @@ class SourceError(BridgeError, exit_code=ExitCode.SOURCE):
 
 class VerificationError(BridgeError, exit_code=ExitCode.VERIFICATION):
     """What was read back is not what was written, or cannot be proven to be."""
-
-
-class ProcessError(BridgeError, exit_code=ExitCode.PROCESS):
-    """A process of the server ends again and again as soon as it is started."""

@@ -20,7 +20,7 @@ from rosbridge_eth.robot.spool import Spool
 from smcrypto import sm2
 
 PASSWORD = b"robot's"
-END = BridgeEnd("robot_1", "server", "127.0.0.1:9", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+END = BridgeEnd("robot_1", "server", ["127.0.0.1:9"], 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 LOG = Log(END.ledger, robot_id(END.robot))
 NOW = datetime.now(UTC)
 CA = ids.create_ca("CA", at=NOW)

@@ -6,6 +6,8 @@ import os
 import shutil
 import signal
 import subprocess
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import redis
@@ -26,7 +28,7 @@ class RedisServer:
         self.port = free_port()
         self.folder = folder
         self.url = f"redis://127.0.0.1:{self.port}/0"
-        self._arguments = [
+        self.arguments = [
             str(program), "--port", str(self.port), "--bind", "127.0.0.1", "--dir", str(folder), "--save", "",
             *(options or DURABLE),
         ]
@@ -36,7 +38,7 @@ class RedisServer:
     def start(self) -> None:
         """Start it on the data that is there, and wait until it answers."""
         with (self.folder / "redis.log").open("ab") as log:
-            self._process = subprocess.Popen(self._arguments, stdout=log, stderr=log)
+            self._process = subprocess.Popen(self.arguments, stdout=log, stderr=log)
         with self.client() as client:
             for _ in range(500):
                 try:
@@ -78,3 +80,51 @@ class RedisServer:
             self._process.send_signal(number)
             self._process.wait(timeout=20)
             self._process = None
+
+
+class RedisClusterServer:
+    """A Redis Cluster of three nodes, each a RedisServer with a third of the slots; no replicas."""
+
+    def __init__(self, folder: Path) -> None:
+        self.nodes: list[RedisServer] = []
+        try:
+            for number in range(3):
+                (folder / str(number)).mkdir()
+                bus = ("--cluster-enabled", "yes", "--cluster-node-timeout", "1000", "--cluster-port", str(free_port()))
+                self.nodes.append(RedisServer(folder / str(number), *DURABLE, *bus))
+            self._join()
+        except BaseException:
+            self.kill()
+            raise
+        self.url = f"redis://127.0.0.1:{self.nodes[0].port}/0"
+
+    def _join(self) -> None:
+        for number, node in enumerate(self.nodes):
+            with node.client() as client:
+                begin, end = 16384 * number // 3, 16384 * (number + 1) // 3 - 1
+                client.execute_command("CLUSTER", "ADDSLOTSRANGE", begin, end)
+                client.execute_command("CLUSTER", "SET-CONFIG-EPOCH", number + 1)
+                for other in self.nodes[:number]:
+                    bus = other.arguments[other.arguments.index("--cluster-port") + 1]
+                    client.execute_command("CLUSTER", "MEET", "127.0.0.1", other.port, bus)
+        self.wait("ok")
+
+    def wait(self, state: str) -> None:
+        """Until every node that runs says this of the cluster ("ok", "fail")."""
+        for node in self.nodes:
+            for _ in range(1000):
+                with node.client() as client, suppress(redis.RedisError):
+                    if client.cluster("info")["cluster_state"] == state:
+                        break
+                time.sleep(0.02)
+            else:
+                raise RuntimeError((node.folder / "redis.log").read_text())
+
+    def client(self) -> redis.RedisCluster:
+        """A plain client."""
+        return redis.RedisCluster.from_url(self.url)
+
+    def kill(self) -> None:
+        """SIGKILL, all of them."""
+        for node in self.nodes:
+            node.kill()

@@ -198,7 +198,7 @@ def test_times_that_are_none_or_have_no_zone_are_refused(option: str, time: str,
 
 def test_usage_errors_end_with_2(capsys: Capture) -> None:
     assert run(["no-such-command"]) == ExitCode.USAGE
-    assert run(["server", "--workers", "0"]) == ExitCode.USAGE
+    assert run(["server", "--shard", "-1"]) == ExitCode.USAGE
     assert run(["read"]) == ExitCode.USAGE
     assert run(["read", "robot_1", "--at", "2026-11-21T10:00:00Z", "--to", "2026-11-22T10:00:00Z"]) == ExitCode.USAGE
     assert run(["read", "robot_1", "--from", "2026-11-22T10:00:00Z", "--to", "2026-11-21T10:00:00Z"]) == ExitCode.USAGE

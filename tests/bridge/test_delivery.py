@@ -340,7 +340,7 @@ def test_a_store_that_is_away_makes_robots_wait_until_it_is_back(
     assert world.run(60)
     assert world.stored_lines() == world.lines
     assert caplog.text.count("the disk is full") == 1
-    assert caplog.text.count("the store: well again") == 1
+    assert caplog.text.count("the store: works again") == 1
 
 
 def test_a_store_that_cannot_be_read_is_told_to_robots_that_come(

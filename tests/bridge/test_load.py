@@ -1,7 +1,7 @@
 """Many robots at once against the real processes: benchmarks/load.py with fewer of them.
 
-Every session has its own identity, spool, socket and account; two workers share the
-port. What is asserted is what a reader finds on the chain at the end.
+Every session has its own identity, spool, socket and account. What is asserted is what a reader finds on the chain at
+the end.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import pytest
 
 import load
 from rosbridge_eth.channel import ServerConfig
-from rosbridge_eth.server import supervisor
+from rosbridge_eth.server import shard
 
-SESSIONS, MESSAGES, WORKERS = 24, 5, 2
+SESSIONS, MESSAGES = 24, 5
 
 
 @pytest.mark.slow
@@ -28,7 +28,7 @@ def test_every_record_of_many_robots_is_on_the_chain_once(
         require("redis-server")
     operator = load.Operator(tmp_path, "embedded", store, SESSIONS, lambda stage: None)
     try:
-        figures = load.run(operator, SESSIONS, MESSAGES, per_chunk=per_chunk, workers=WORKERS, limit=120)
+        figures = load.run(operator, SESSIONS, MESSAGES, per_chunk=per_chunk, limit=120)
     finally:
         operator.close()
     print(load.table([figures]))
@@ -36,8 +36,8 @@ def test_every_record_of_many_robots_is_on_the_chain_once(
     assert figures.chunks == figures.stored == figures.on_chain == SESSIONS * MESSAGES / per_chunk
     assert figures.equal == SESSIONS * MESSAGES
     assert (figures.lost, figures.doubled, figures.altered, figures.unsound) == (0, 0, 0, [])
-    # A session's own keys, certificates and windows, beside what a worker loads as it starts to work.
-    assert figures.growth_kib_per_session * SESSIONS < WORKERS * 16 * 1024 + SESSIONS * 256
+    # A session's own keys, certificates and windows, beside what a shard loads as it starts to work.
+    assert figures.growth_kib_per_session * SESSIONS < 32 * 1024 + SESSIONS * 256
 
 
 @pytest.mark.slow
@@ -45,11 +45,11 @@ def test_more_robots_than_their_address_may_fail_at_once_wait_and_get_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The caps on strangers delay honest robots behind one address, and keep none of them out."""
-    monkeypatch.setattr(supervisor, "ServerConfig", partial(
+    monkeypatch.setattr(shard, "ServerConfig", partial(
         ServerConfig, max_half_open=4, source_rate=1.0, source_burst=3.0))  # fmt: skip
     operator = load.Operator(tmp_path, "embedded", "sqlite", 24, lambda stage: None)
     try:
-        figures = load.run(operator, 24, 2, workers=1, limit=120)
+        figures = load.run(operator, 24, 2, limit=120)
     finally:
         operator.close()
     assert sum(figures.dropped.values()) > 0  # the caps were reached, or nothing was tested

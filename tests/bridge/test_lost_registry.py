@@ -12,17 +12,17 @@ import pytest
 
 from bridge.home.world import PASSPHRASE, World
 from bridge.machine import PATIENCE, Machine, Running
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
-from rosbridge_eth.config import load_server_config
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
+from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.errors import ExitCode, StoreError
+from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import Trust, load_identity
 from rosbridge_eth.operator.bundle import join, read_bundle
 from rosbridge_eth.operator.enrolment import load_server_identity
 from rosbridge_eth.operator.registry import Registry
-from rosbridge_eth.server import supervisor
+from rosbridge_eth.server import shard
 from rosbridge_eth.server.reception import Worker
-from rosbridge_eth.server.supervisor import Secrets, Supervisor, open_reception, open_submitter
+from rosbridge_eth.server.shard import Secrets, open_reception, open_submitter
 
 
 def take_away(world: World) -> None:
@@ -55,10 +55,10 @@ def test_a_worker_whose_registry_is_gone_ends_and_says_so(
     place = RobotHome(world.path / "robot-1")
     join(place, read_bundle(world.register().bundle.read_bytes()))
     robot, roots = load_identity(place.identity, b"robot's")
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     reception = open_reception(
-        0, load_server_config(world.home.config), load_server_identity(world.home, PASSPHRASE), world.home,
-        Registry(world.home.registry), world.open_store(), world.home.deployment(),
+        load_server_config(world.home.config), load_server_identity(world.home, PASSPHRASE), world.home,
+        Registry(world.home.registry), world.open_store(),
     )  # fmt: skip
     serving = Running(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)))
     try:
@@ -94,17 +94,16 @@ def test_a_submitter_writes_for_nobody(world: World, harm: Harm, said: str) -> N
     assert world.written() == []
 
 
-def test_the_submitters_process_ends_so_that_the_next_one_opens_what_is_there(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shard_ends_so_that_the_next_one_opens_what_is_there(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     secrets = Secrets(load_server_identity(world.home, PASSPHRASE), world.keys)
-    running = Supervisor(world.home, load_server_config(world.home.config), secrets)
-    monkeypatch.setattr(supervisor.Ledger, "connect", lambda url, deployment: world.ledger)
-    running._start("submitter", running._submit)
-    process = running._children["submitter"]
-    process.join(1.0)
-    assert process.is_alive()
-    take_away(world)
-    process.join(PATIENCE)
-    assert process.exitcode == ExitCode.STORE
-    assert process.exitcode in supervisor.PATIENT  # started again for as long as it takes
+    monkeypatch.setattr(shard.Ledger, "connect", lambda url, deployment: world.ledger)
+    config = load_server_config(world.home.config).model_copy(update={"listen": Address("127.0.0.1", 0)})
+    begun, ends = time.monotonic(), time.monotonic() + PATIENCE
+
+    def stopped() -> bool:
+        if world.home.registry.exists() and time.monotonic() > begun + 1.0:
+            take_away(world)
+        return time.monotonic() > ends
+
+    with pytest.raises(StoreError, match="registry"):
+        shard.run_shard(0, config, world.home, secrets, stopped)

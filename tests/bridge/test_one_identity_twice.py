@@ -14,7 +14,7 @@ from eth_hash.auto import keccak
 from bridge.machine import PATIENCE, Machine, Running
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Disconnected, End, Server, ServerConfig, cookie_key
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.log.sqlite import SqliteStore
@@ -31,7 +31,7 @@ LEDGER = bytes(32)
 
 @pytest.fixture
 def serving(tmp_path: Path) -> Iterator[Running]:
-    [sock] = server_sockets(("127.0.0.1", 0))
+    sock = server_socket(("127.0.0.1", 0))
     server = Server(ServerConfig(), HUB, TRUST, cookie_key(HUB), time.monotonic())
     reception = Reception(
         server, SqliteStore(tmp_path / "store.sqlite", LEDGER, 1 << 24, 1 << 24), LEDGER,

@@ -29,7 +29,7 @@ from rosbridge_eth.ledger.nodes import Anvil
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.robot.sources import sample_bag
-from rosbridge_eth.server.supervisor import open_store
+from rosbridge_eth.server.shard import open_store
 
 pytestmark = [pytest.mark.service, pytest.mark.slow]
 WORDS = {"operator": "an operator's passphrase", "reader": "the owner's passphrase", "robot": "a robot's password"}

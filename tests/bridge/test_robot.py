@@ -16,7 +16,7 @@ import pytest
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
-from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id
@@ -60,7 +60,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
     """Robots with nobody at the other end."""
     ca = ids.create_ca("operator", at=NOW)
     who = ids.enrol(ca, ids.Role.ROBOT, "robot_1", at=NOW)
-    [nobody] = server_sockets(("127.0.0.1", 0))
+    nobody = server_socket(("127.0.0.1", 0))
 
     def made(count: int) -> Robot:
         now = time.monotonic()
@@ -70,7 +70,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
                            stream_line=stream_line("bag", "test"), period=0.001, now=now)
         return Robot(source=Source(count), capture=Capture([TopicRule(TOPIC)], source_kind="bag"), writer=writer,
                      spool=spool, client=client, sender=Sender(client, spool, writer),
-                     server=Address(*nobody.getsockname()[:2]))
+                     servers=[Address(*nobody.getsockname()[:2])])
 
     yield made
     nobody.close()
@@ -106,7 +106,7 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
     assert len(set(seen)) == 1 and seen[0] < 3 * RING, "nothing more is captured while nothing can be kept"
     assert robot.captured == 3 * RING
     assert "the spool: the disk is full" in caplog.text
-    assert "the spool: well again" in caplog.text
+    assert "the spool: works again" in caplog.text
     assert f"{robot.chunks} chunks not yet at the server" in robot.summary
 
 
@@ -159,7 +159,7 @@ def test_a_spool_that_can_be_written_and_not_read_is_told_once_and_once_that_it_
                 robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: well again"]
+    assert [line for line in caplog.messages if "the spool" in line][1:] == ["the spool: works again"]
 
 
 def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(

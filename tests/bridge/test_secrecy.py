@@ -27,8 +27,8 @@ from rosbridge_eth.cli.relay import Harm
 from rosbridge_eth.identity import load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger, nodes
 from rosbridge_eth.log.chunk import MAX_READERS, Chunk, content_key, robot_id
-from rosbridge_eth.logs import LOGGER, TextFormatter
 from rosbridge_eth.robot.sources.bag import sample_bag
+from rosbridge_eth.terminal import LOGGER, TextFormatter
 from smcrypto import sm2
 
 PLACES = ("network", "chain", "operator's home", "spool", "logs")

@@ -25,7 +25,7 @@ from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.operator.bundle import join, read_bundle
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import Kind, Verdict, read_robot
-from rosbridge_eth.server.supervisor import open_submitter
+from rosbridge_eth.server.shard import open_submitter
 
 SERVED = 3.0  # seconds of the server's, for what it has to be written and confirmed
 

@@ -1,23 +1,14 @@
-"""Sockets under the channel: a loop that receives, hands out events, and sends. The only part that waits.
-
-Several processes of a server share one port by SO_REUSEPORT. Where the kernel takes a filter for it (Linux,
-SO_ATTACH_REUSEPORT_CBPF), a datagram goes to the process whose number stands in its connection id, so a robot whose
-address changes stays with its process; elsewhere the kernel chooses by address, and such a robot makes a new session
-after `patience`.
-"""
+"""Sockets under the channel: a loop that receives, hands out events, and sends. The only part that waits."""
 
 from __future__ import annotations
 
-import array
 import contextlib
 import errno
 import select
 import socket
-import struct
-import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 
 from rosbridge_eth.channel.admission import Address
@@ -31,8 +22,6 @@ SEND_BUFFER = 1 << 20
 LONGEST = 2048  # bytes; a longer datagram is cut, and fails its authentication
 BATCH = 128  # datagrams taken before events are handed out and answers sent
 ASK_AGAIN = 10.0  # seconds between questions for the address of a server with which there is no session
-
-_SO_ATTACH_REUSEPORT_CBPF = 51  # include/uapi/asm-generic/socket.h
 
 _NOT_THE_NETWORK = frozenset({errno.EBADF, errno.ENOTSOCK, errno.EFAULT, errno.ENOMEM})
 """Errors of recvfrom that say that this socket is of no use any more. Any other is news of a datagram sent before."""
@@ -66,56 +55,20 @@ def client_socket(server: Address) -> tuple[socket.socket, Address]:
     return _open(family), address
 
 
-def server_sockets(address: Address, workers: int = 1) -> list[socket.socket]:
-    """Sockets bound to one address, one for each worker, in the order of their numbers.
-
-    Open them in the parent process and let each worker inherit its own; while
-    the parent keeps them open, a worker that is started again finds its
-    datagrams waiting. NetworkError if the port is taken or not allowed.
-    """
+def server_socket(address: Address) -> socket.socket:
+    """A socket bound to an address. NetworkError if the port is taken or not allowed."""
     family, place = _resolve(*address, socket.AI_PASSIVE)
-    sockets: list[socket.socket] = []
+    sock = _open(family)
     try:
-        # Bound without SO_REUSEPORT first: another server's port must be an error, not half of its datagrams.
-        with _open(family) as probe:
-            probe.bind(place)
-            place = (place[0], probe.getsockname()[1])
-        for _ in range(workers):
-            sockets.append(_open(family))
-            if workers > 1:
-                sockets[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-            sockets[-1].bind(place)
+        sock.bind(place)
     except OSError as error:
-        for sock in sockets:
-            sock.close()
+        sock.close()
         mend = {
             errno.EADDRNOTAVAIL: "no interface here has that address; listen at one of them, or at 0.0.0.0 for all",
             errno.EACCES: "choose a port from 1024 on, or run with the right to open it",
         }.get(error.errno or 0, "stop the program that has it, or choose another port")
         raise NetworkError(f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; {mend}") from error
-    if workers > 1 and sys.platform.startswith("linux"):
-        _steer(sockets[0], workers)
-    return sockets
-
-
-def _steer(sock: socket.socket, workers: int) -> None:
-    """Send each datagram to the socket whose index is the first byte of its connection id, modulo `workers`.
-
-    Where the kernel takes the filter; otherwise it chooses by address. Its program, over the UDP payload:
-    """
-    program = [
-        (0x30, 0, 0, 0),  # A = byte 0: the kind
-        (0x35, 0, 2, 0x40),  # kind >= DATA ? go on : skip 2
-        (0x30, 0, 0, 1),  # A = byte 1: first of the server's connection id, its worker's number
-        (0x05, 0, 0, 1),  # skip 1
-        (0x30, 0, 0, 3),  # A = byte 3: first of the client's connection id, in HELLO and PROOF
-        (0x94, 0, 0, workers),  # A %= workers
-        (0x16, 0, 0, 0),  # return A
-    ]
-    code = array.array("B", b"".join(struct.pack("=HBBI", *step) for step in program))
-    argument = struct.pack("@HP", len(program), code.buffer_info()[0])
-    with contextlib.suppress(OSError):  # an old kernel or a sandbox
-        sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, argument)
+    return sock
 
 
 class UdpLoop:
@@ -198,13 +151,15 @@ class UdpLoop:
 
 class ClientLoop(UdpLoop):
     """Drives a client whose server is given by name: one that has no address yet, as before the network is up, or
-    another one tomorrow."""
+    another one tomorrow. Of several servers they are asked in turn until there is a session."""
 
-    def __init__(self, client: Client, server: Address, on_event: Callable[[Event], None]) -> None:
+    def __init__(self, client: Client, servers: Sequence[Address], on_event: Callable[[Event], None]) -> None:
         super().__init__(client, _open(socket.AF_INET), on_event)
         self.resolved = True
         """False while there is no session and the name has no address."""
-        self._client, self._server = client, server
+        self._client, self._servers = client, servers
+        self._asked, self._taken = 0, 0  # which server is asked next, and to which the client connects
+        self._left_at = float("-inf")
         self._address: Address | None = None
         self._answer: Future[tuple[int, Address]] | None = None
         self._ask_at = float("-inf")
@@ -212,7 +167,7 @@ class ClientLoop(UdpLoop):
     def seek(self, now: float) -> None:
         """While there is no session: ask for the server's address, and connect to a new one. Call it in each turn."""
         if self._client.state is State.CONNECTED:
-            self.resolved = True
+            self.resolved, self._asked = True, self._taken
             return
         if self._answer is not None and self._answer.done():
             answer, self._answer = self._answer, None
@@ -223,12 +178,22 @@ class ClientLoop(UdpLoop):
                 self._on_event(Unresolved(str(error)))
         elif self._answer is None and now >= self._ask_at:
             self._answer, self._ask_at = Future(), now + ASK_AGAIN
+            self._taken = self._asked % len(self._servers)
+            self._asked = self._taken + 1
             # A thread of its own: getaddrinfo may wait half a minute for a name server, and cannot be told to stop.
-            threading.Thread(target=self._ask, args=(self._answer,), name="resolver", daemon=True).start()
+            asking = (self._servers[self._taken], self._answer)
+            threading.Thread(target=self._ask, args=asking, name="resolver", daemon=True).start()
 
-    def _ask(self, answer: Future[tuple[int, Address]]) -> None:
+    def go(self, server: Address, now: float) -> None:
+        """End the session and make one with this server instead, or else with the last of the others."""
+        self._client.close(now)
+        self._servers, self._asked, self._address = (server, self._servers[-1]), 0, None
+        if now >= self._left_at + ASK_AGAIN:  # two that name each other are not asked without end
+            self._left_at = self._ask_at = now
+
+    def _ask(self, server: Address, answer: Future[tuple[int, Address]]) -> None:
         try:
-            answer.set_result(_resolve(*self._server))
+            answer.set_result(_resolve(*server))
         except NetworkError as error:
             answer.set_exception(error)
         self.wake()

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from html import escape
@@ -22,25 +22,23 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 from rich.table import Table
 
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
-from rosbridge_eth.logs import log_to_stderr
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
-from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
+from rosbridge_eth.robot.sources import sample_bag
 from rosbridge_eth.robot.topics import robot_toml
-from rosbridge_eth.terminal import data, errors, table, talk
+from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.cli.relay import Harm
     from rosbridge_eth.reading.compare import Comparison
     from rosbridge_eth.robot.loop import Robot
-    from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.submitter import Submitter
+    from rosbridge_eth.server.shard import Shard
 
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
@@ -104,27 +102,17 @@ class DemoResult:
 
 
 @contextmanager
-def _serving(worker: Worker, submitter: Submitter) -> Iterator[Callable[[], None]]:
-    """The server's parts, in two threads; gives what raises their failure in this one."""
+def _serving(shard: Shard) -> Iterator[Callable[[], None]]:
+    """The server, in threads; gives what raises its failure in this one."""
     stop = threading.Event()
-
-    def submit() -> None:
-        while not stop.wait(min(0.05, submitter.turn(time.time()))):
-            continue
-
-    def check() -> None:
-        for task in tasks:
-            if task.done():
-                task.result()
-
-    with ThreadPoolExecutor(2) as threads:
-        tasks = [threads.submit(worker.run, stop.is_set), threads.submit(submit)]
+    with ThreadPoolExecutor(1) as threads:
+        task = threads.submit(shard.run, stop.is_set)
         try:
-            yield check
+            yield lambda: task.result() if task.done() else None
         finally:
             stop.set()
-            worker.loop.wake()
-    check()
+            shard.worker.loop.wake()
+    task.result()
 
 
 def run_demo(
@@ -144,7 +132,7 @@ def run_demo(
     from rosbridge_eth.reading.compare import compare
     from rosbridge_eth.robot.loop import open_robot
     from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.supervisor import open_reception, open_store, open_submitter
+    from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
 
     started, stages = time.monotonic(), Stages()
     home, robot_home, reader_home = (
@@ -175,22 +163,22 @@ def run_demo(
     with stage("registration"):
         made = administration.register_robot(
             home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
-            inbox=lambda: open_store(config, home), request=Request.decode(robot_home.request.read_bytes()),
+            inbox=lambda: open_store(config, home, 0), request=Request.decode(robot_home.request.read_bytes()),
         )
         join(robot_home, read_bundle(made.bundle.read_bytes()))
 
-    [sock] = server_sockets(config.listen)
-    inbox, identity = open_store(config, home), administration.load_server_identity(home, passphrase)
-    reception = open_reception(0, config, identity, home, registry, inbox, deployment)
-    worker = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle))
-    submitter = open_submitter(config, ledger, open_store(config, home), registry, keys)
+    sock = server_socket(config.listen)
+    inbox, identity = open_store(config, home, 0), administration.load_server_identity(home, passphrase)
+    reception = open_reception(config, identity, home, registry, inbox)
+    submitter = open_submitter(config, ledger, open_store(config, home, 0), registry, keys)
+    shard = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
     with closing(Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)) as relay:
         # Short chunks, so that there are several.
         more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
         robot_home.config.write_text(f'server = "127.0.0.1:{relay.port}"\n{robot_toml(topics, str(bag))}{more}')
         robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
 
-        with _serving(worker, submitter) as check:
+        with _serving(shard) as check:
 
             def progress() -> None:
                 check()
@@ -258,31 +246,20 @@ def demo(
 
     Exits with 9 if a single record is missing, altered or doubled.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from rosbridge_eth.cli.relay import Harm
     from rosbridge_eth.reading import outputs
 
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
-    columns = (TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with ExitStack() as stack:
-        progress = stack.enter_context(Progress(*columns, console=errors))
-        home = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosbridge-eth-"))
-        with closing(BagSource(chosen, Selection(topics))) as opened:
-            total = opened.message_count
-        names = {"captured": "records captured", "stored": "lines stored", "verified": "records verified"}
-        bars = {stage: progress.add_task(name, total=total) for stage, name in names.items()}
+    with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
         def show(stages: Stages) -> None:
-            for name, bar in bars.items():
-                done = getattr(stages, name)
-                progress.update(bar, completed=done, total=max(total, done))  # more lines than records: types have some
+            progress.update(f"{stages.captured} records captured, {stages.stored} lines stored by the server")
 
         result = run_demo(
             Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
-            on_stage=lambda text: progress.console.print(f"· {text}"), on_progress=show,
+            on_stage=lambda text: errors.print(f"· {text}"), on_progress=show,
         )
     (report / "records.jsonl").write_text("".join(map(outputs.json_line, result.records)), encoding="utf-8")
     trajectory = outputs.Trajectory()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,19 +12,29 @@ from urllib.parse import urlsplit
 import typer
 
 from rosbridge_eth import terminal
-from rosbridge_eth.channel.udp import server_sockets
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import load_server_config
-from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
+from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome, shard_of
 from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.config.values import Address, counted
 from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
-from rosbridge_eth.logs import LogFormat, log_to_stderr
+from rosbridge_eth.log.chunk import robot_id
 from rosbridge_eth.operator import status
 from rosbridge_eth.operator.bundle import Request
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.terminal import OPERATOR_HOME, READER_HOME, OperatorHomeOption, PassphraseFile, live, talk, utc_now
+from rosbridge_eth.terminal import (
+    OPERATOR_HOME,
+    READER_HOME,
+    LogFormat,
+    OperatorHomeOption,
+    PassphraseFile,
+    live,
+    log_to_stderr,
+    talk,
+    utc_now,
+)
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Keyring, Ledger
@@ -52,7 +62,7 @@ def add_commands(app: typer.Typer) -> None:
     app.command(epilog="Example: rosbridge-eth handover 0x5aAe…; rosbridge-eth handover --home new")(handover)
     app.command(epilog="Example: rosbridge-eth backup copy-of-operator")(backup)
     app.command(epilog="Example: rosbridge-eth passwd --home robot")(passwd)
-    app.command(epilog="Example: rosbridge-eth server --workers 2")(server)
+    app.command(epilog="Example: rosbridge-eth server; rosbridge-eth server --shard 2")(server)
 
 
 def passphrase_of(home: OperatorHome, file: Path | None) -> bytes:
@@ -75,10 +85,12 @@ def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring
     return place, passphrase, Keyring.load(place.accounts, passphrase)
 
 
-def _inbox(place: OperatorHome) -> Store:
-    from rosbridge_eth.server.supervisor import open_store
+def _inbox(place: OperatorHome, robot: str) -> Store:
+    """The store of the shard to which this robot belongs."""
+    from rosbridge_eth.server.shard import open_store
 
-    return open_store(load_server_config(place.config), place)
+    config = load_server_config(place.config)
+    return open_store(config, place, shard_of(robot_id(robot), config.shards))
 
 
 @contextmanager
@@ -124,7 +136,8 @@ def up(
         place, secret, keys = _opened(home, passphrase_file)
         known = load_server_config(place.config)
         for key, given, now in (
-            ("listen", listen, known.listen), ("public", public, known.public), ("[chain] url", chain, known.chain.url),
+            ("listen", listen, known.listen), ("public", public, ", ".join(map(str, known.public))),
+            ("[chain] url", chain, known.chain.url),
         ):
             if given not in (None, str(now)):
                 raise ConfigError(f"{place.config} has another address than the option: change {key} there")
@@ -144,8 +157,8 @@ def up(
             anvil.fund(place.account, FUNDS)
             talk(f"A local chain answers at {anvil.url}, kept in {state}.")
         if not deployed:
-            for sock in server_sockets(settings.listen):  # a port that is taken is told before a contract is paid for
-                sock.close()
+            for shard in range(settings.shards):  # a port that is taken is told before a contract is paid for
+                server_socket(settings.listen.next(shard)).close()
             made = deploy_contract(place, url, keys)
             if anvil is not None:
                 anvil.keeps(made.contract)  # a kill costs some seconds of the chain; without its contract, all of it
@@ -154,7 +167,7 @@ def up(
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
-        _serve(place, secret, keys, None, look)
+        _serve(place, secret, keys, look=look)
     talk("Everything is kept: `up` goes on with it.")
 
 
@@ -189,7 +202,7 @@ def init(
     )
     talk(f"{home} is an operator's home. Keep its passphrase: nothing in it can be recovered without.")
     talk(f"{reader} is the home of the reader `owner`: carry it to the machine that reads; {home} opens no record.")
-    talk(f"Robots are told to send to {load_server_config(place.config).address_for_robots()}.")
+    talk(f"Robots are told to send to {load_server_config(place.config).addresses()[0]}.")
     talk(f"The operator's account is {keys.operator.address}; it pays for the contract and the robots.")
     talk("Next: `chain` starts a local node (or put ETH on that account at yours), then `deploy`.")
 
@@ -251,8 +264,8 @@ def register(
     ca = _ca(place, passphrase, ca_passphrase_file)
     with ledger_of(place) as ledger:
         made = register_robot(
-            place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place), now=utc_now(), request=asked,
-            password=secret, replace=replace, compromised=compromised,
+            place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place, name), now=utc_now(),
+            request=asked, password=secret, replace=replace, compromised=compromised,
         )  # fmt: skip
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if asked is None:
@@ -307,7 +320,7 @@ def revoke(
     with ledger_of(place, check=False) as ledger:  # the server is told even where the node is away
         ended = administration.revoke(
             place, role, name, keys=keys, ledger=ledger, now=utc_now(), compromised=compromised,
-            inbox=lambda: _inbox(place),
+            inbox=lambda: _inbox(place, name),
         )  # fmt: skip
     talk(f"{role} {name} is revoked" + (f", on the chain in block {ended.block}." if ended.block is not None else "."))
     if ended.buried:
@@ -380,28 +393,29 @@ def passwd(
 
 def server(
     home: OperatorHomeOption = OPERATOR_HOME,
-    workers: Annotated[int | None, typer.Option(min=1, max=64, help="Processes that share the port.")] = None,
+    shard: Annotated[list[int] | None, typer.Option(
+        min=0, help="Run this shard only, where the others run on other machines or as services of their own.")] = None,
     passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
     """Take chunks from robots and bring them onto the chain."""
     log_to_stderr(log_format, verbose)
-    _serve(*_opened(home, passphrase_file), workers)
+    _serve(*_opened(home, passphrase_file), shard or ())
 
 
 def _serve(
-    place: OperatorHome, passphrase: bytes, keys: Keyring, workers: int | None,
+    place: OperatorHome, passphrase: bytes, keys: Keyring, only: Sequence[int] = (),
     look: Callable[[], None] = lambda: None,
 ) -> None:  # fmt: skip
-    """Run the server, with so many workers, else as server.toml says; what `look` raises ends it in good order."""
+    """Run the server, or these shards of it; what `look` raises ends it in good order."""
     from rosbridge_eth.operator.enrolment import load_server_identity
-    from rosbridge_eth.server.supervisor import Secrets, Supervisor
+    from rosbridge_eth.server.parent import Parent
+    from rosbridge_eth.server.shard import Secrets
 
-    config = load_server_config(place.config)
     secrets = Secrets(load_server_identity(place, passphrase), keys)
 
-    def ready(address: Address) -> None:
-        talk(f"Listening on UDP {address} (workers: {workers or config.workers}); Ctrl-C ends it.")
+    def ready(addresses: list[Address]) -> None:
+        talk(f"Listening on UDP {', '.join(map(str, addresses))}; Ctrl-C ends it.")
 
     with live(lambda: status.fleet(place)) as show:
 
@@ -409,4 +423,4 @@ def _serve(
             show()
             look()
 
-        Supervisor(place, config, secrets, workers).run(ready, on_look)
+        Parent(place, secrets, only).run(ready, on_look)

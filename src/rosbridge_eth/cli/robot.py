@@ -27,12 +27,11 @@ from rosbridge_eth.config.passphrases import read_passphrase, warn_if_others_rea
 from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.identity import check_name
 from rosbridge_eth.log.chunk import STREAM_SIZE
-from rosbridge_eth.logs import LogFormat, log_to_stderr, one_line
 from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
 from rosbridge_eth.robot.sources import Offer, Selection
 from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
-from rosbridge_eth.terminal import errors, live, plain, table, talk
+from rosbridge_eth.terminal import LogFormat, errors, live, log_to_stderr, one_line, plain, table, talk
 
 if TYPE_CHECKING:
     from rosbridge_eth.robot.loop import Robot
@@ -157,7 +156,7 @@ def robot(
     """
     from rosbridge_eth.robot.loop import open_robot, read_again
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.supervisor import Beats, notify
+    from rosbridge_eth.server.parent import notify
 
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
@@ -172,7 +171,7 @@ def robot(
     again, event, at_terminal = threading.Event(), threading.Event(), os.isatty(0)
     with ExitStack() as stack:
         running = open_robot(place, settings, password)  # a second robot gets no further: the spool is in use
-        stack.enter_context(metrics.shared(home))
+        stack.callback(metrics.file_of(home, "robot").unlink, missing_ok=True)
         _asked_for(place, running.box.triggers)  # when nobody was there to take it
 
         def on_signal(number: int, frame: FrameType | None) -> None:
@@ -185,12 +184,9 @@ def robot(
 
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1):
             signal.signal(number, on_signal)
-        if settings.monitor is not None:
-            web = metrics.Web(settings.monitor, ["robot"])
-            web.start()
-            stack.callback(web.stop)
-        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.server_address}; Ctrl-C ends it.")
-        beats, rates, told = Beats(), metrics.Rates(), not errors.is_terminal
+        stack.enter_context(metrics.served(settings.monitor))
+        talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.addresses()[0]}; Ctrl-C ends it.")
+        beats, rates, told = metrics.Beats(1.0), metrics.Rates(), not errors.is_terminal
         show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
 
         def on_turn() -> None:
@@ -212,6 +208,7 @@ def robot(
                         before = " or before" if any(newest[STREAM_SIZE:]) else ""
                         talk(f"The first record is in block {block}{before}.")
                     metrics.show_robot(end.robot, running, time.time())
+                    metrics.save(metrics.file_of(home, "robot"))
                 show()
 
         notify("READY=1")
@@ -229,10 +226,10 @@ def trigger(
 
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
-    try:
-        known = [labels["trigger"] for what, labels, _ in metrics.figures(home) if what == "trigger_fired"]
-    except ValueError:
-        raise nobody from None
+    figures = metrics.running(home).get("robot")
+    if figures is None:
+        raise nobody
+    known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]
     if not known or (name is not None and name not in known):
         raise ConfigError(f"the robot has no trigger{f' {name}' if name else ''}; it has: {', '.join(known) or 'none'}")
     wanted = known if name is None else [name]

@@ -1,8 +1,8 @@
 """The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
 Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none: its
-`.unfinished` is left, and who makes a home there begins anew. While a server or robot runs, `.figures` leads to what it
-counts (metrics).
+`.unfinished` is left, and who makes a home there begins anew. While a shard of the server or a robot runs,
+`.shard-0.prom` or `.robot.prom` is what it counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:
 
@@ -14,7 +14,7 @@ An operator's home (made by `init`); it holds no reader's key and no robot's:
     registry.sqlite      who is enrolled
     deployment.json      the contract, and the chain it is on (made by `deploy`)
     reader.toml          the same for readers, to be put beside their keys
-    store.sqlite         the server's replica of the robots' logs
+    store-0.sqlite       the replica of their logs that shard 0 of the server has; store-1.sqlite and so on
     bundles/             what `register` writes for robots
 
 A robot's home (made by `join`):
@@ -48,9 +48,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
+from rosbridge_eth.config.values import Address, parse_address
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
-from rosbridge_eth.log.chunk import ledger_id
+from rosbridge_eth.log.chunk import ledger_id, robot_id
 
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
 _FORMAT = "rosbridge-eth home 3"
@@ -66,6 +67,11 @@ class HomeKind(StrEnum):
 
 
 _WHOSE = {HomeKind.OPERATOR: "an operator's", HomeKind.ROBOT: "a robot's", HomeKind.READER: "a reader's"}
+
+
+def shard_of(tk: bytes, shards: int) -> int:
+    """To which of so many shards a robot belongs."""
+    return int.from_bytes(tk, "big") % shards
 
 
 def ledger_of(chain_id: int, genesis: str, contract: str) -> bytes:
@@ -90,11 +96,11 @@ class Deployment:
 
 @dataclass(frozen=True, slots=True)
 class BridgeEnd:
-    """What a robot knows of the other end. `server_address` is HOST:PORT; the ledger as in Deployment."""
+    """What a robot knows of the other end. `servers` has HOST:PORT of each shard; the ledger as in Deployment."""
 
     robot: str
     server_name: str
-    server_address: str
+    servers: list[str]
     chain_id: int
     genesis: str
     contract: str
@@ -103,6 +109,13 @@ class BridgeEnd:
     def ledger(self) -> bytes:
         """As Deployment.ledger."""
         return ledger_of(self.chain_id, self.genesis, self.contract)
+
+    def addresses(self) -> tuple[Address, Address]:
+        """Where the server is to be asked: at the robot's shard, and else at the first one, which is always there.
+
+        Where the number of shards is another by now, either says where the robot belongs."""
+        shard = shard_of(robot_id(self.robot), len(self.servers))
+        return parse_address(self.servers[shard]), parse_address(self.servers[0])
 
 
 # JSON files
@@ -202,6 +215,9 @@ class OperatorHome:
         self.deployment_file = path / "deployment.json"
         self.reader_config = path / "reader.toml"
         self.bundles = path / "bundles"
+
+    def store(self, shard: int) -> Path:
+        return self.path / f"store-{shard}.sqlite"
 
     @property
     def ca(self) -> Path:

@@ -319,8 +319,8 @@ class RobotConfig(Section):
     readers: Certificates (PEM) of those who may read the records, 16 at most; without it, those in the folder `readers`
     of the home: the bundle's and what is put there by hand. Joining again removes what its bundle does not name.
 
-    monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9465`; without it there are none.
-    Keep it on the machine or a private network.
+    monitor: HTTP address of `/metrics`, such as `127.0.0.1:9465`; without it there is none. Keep it on the machine or a
+    private network.
 
     source: Where messages come from (below). Without it, the ROS that the environment speaks of (`ROS_VERSION`,
     `ROS_MASTER_URI`); where it speaks of none, the robot does not start.
@@ -447,11 +447,11 @@ class ChainConfig(Section):
 
 
 class StoreConfig(Section):
-    """The store: the server's replica of the robots' logs, until they are on the chain.
+    """The server's replica of the robots' logs, until they are on the chain.
 
-    url: `"sqlite"`, in the server's folder, or the URL of a Redis.
+    url: `"sqlite"`, a file for each shard in the server's folder, or the URL of a Redis, which all shards share.
 
-    max_size: Bytes kept, dead letters included.
+    max_size: Bytes that a shard keeps in its file, dead letters included; a Redis has its own `maxmemory`.
 
     share: Bytes of one robot. Above it, that robot waits, and no other.
     """
@@ -480,33 +480,36 @@ class FundsConfig(Section):
 class ServerConfig(Section):
     """The server's configuration, `server.toml`.
 
-    listen: UDP address on which robots are answered.
+    listen: UDP address on which robots are answered: that of the first shard, and each further one has the next port.
 
-    public: The address that robots are given in their bundles; without it, `listen`.
+    public: The first shard's address as robots reach it, for their bundles; without it, `listen`. A list has that of
+    every shard, where they run on several machines.
 
     name: The name in the server's certificate.
 
-    workers: Processes that share the port.
+    shards: Processes, each with its port, store and submitter; each robot belongs to one of them. It may be changed at
+    any time (docs/howto-shards.md).
 
     channel: Handshake modes that are taken: `"exchange"`, and `"transport"` where it is wanted.
 
-    monitor: HTTP address of `/metrics`, `/healthz` and `/readyz`, such as `127.0.0.1:9464`; without it there are none.
-    Whoever reaches it reads names, balances and counts: keep it on the machine or a private network.
+    monitor: HTTP address of `/metrics`, such as `127.0.0.1:9464`, of the first shard, and each further one has the next
+    port; without it there is none. Whoever reaches it reads names, balances and counts: keep it on the machine or a
+    private network.
 
     passphrase_file: A file whose first line is the operator passphrase, for commands that are given none and a server
     that starts by itself. Whoever reads it and the home is the operator.
 
     chain: The node (below).
 
-    store: The server's replica of the logs (below).
+    store: The replica of the robots' logs (below).
 
     funds: Robots' accounts (below).
     """
 
     listen: HostPort = Address("0.0.0.0", 7410)  # noqa: S104 - a server's default
-    public: HostPort | None = None
+    public: Annotated[list[HostPort], BeforeValidator(_listed)] = []
     name: Name = "server"
-    workers: int = Field(default=1, ge=1, le=64)
+    shards: int = Field(default=1, ge=1, le=64)
     channel: list[Mode] = Field(default=["exchange"], min_length=1)
     monitor: HostPort | None = None
     passphrase_file: FilePath | None = None
@@ -514,15 +517,24 @@ class ServerConfig(Section):
     store: StoreConfig = StoreConfig()
     funds: FundsConfig = FundsConfig()
 
-    def address_for_robots(self) -> Address:
-        """`public`, or `listen`; ConfigError where that is no address that a robot could send to."""
-        address = self.public or self.listen
-        if address.nowhere:
+    @validator(mode="after")
+    def _consistent(self) -> ServerConfig:
+        if len(self.public) not in (0, 1, self.shards):
+            raise ValueError(f"has {len(self.public)} addresses in `public`; write one, or one for each of the shards")
+        for first in filter(None, [self.listen, self.monitor, *(self.public if len(self.public) == 1 else ())]):
+            if self.shards > 1 and not 0 < first.port <= 65536 - self.shards:
+                raise ValueError(f"has shards = {self.shards}, for which there are no ports from {first} on")
+        return self
+
+    def addresses(self) -> list[Address]:
+        """Of each shard, as robots reach it; ConfigError where that is no address that a robot could send to."""
+        first, *others = self.public or [self.listen]
+        if lost := [address for address in (first, *others) if address.nowhere]:
             raise ConfigError(
-                f"robots would be told to send to {address}, which is no machine's address: write into server.toml"
+                f"robots would be told to send to {lost[0]}, which is no machine's address: write into server.toml"
                 ' public = "HOST:PORT", as robots reach the server'
             )
-        return address
+        return [first, *others] if others else [first.next(shard) for shard in range(self.shards)]
 
 
 # The reader

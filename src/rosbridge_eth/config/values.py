@@ -84,6 +84,10 @@ class Address(NamedTuple):
     def __str__(self) -> str:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
+    def next(self, count: int) -> Address:
+        """The same host, `count` ports on."""
+        return self._replace(port=self.port + count if self.port else 0)
+
     @property
     def nowhere(self) -> bool:
         """Whether nothing can be sent there: port 0, or any address (0.0.0.0 or ::, in whatever form)."""

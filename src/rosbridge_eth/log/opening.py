@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.store import Store
 
 
 def open_store(
-    url: str, *, home: Path, ledger: bytes, max_bytes: int, max_bytes_per_robot: int, read_only: bool = False
+    url: str, *, file: Path, ledger: bytes, max_bytes: int, max_bytes_per_robot: int, read_only: bool = False
 ) -> Store:
-    """The store at `url`, for one ledger (chunk.ledger_id): "sqlite", in the folder `home`, or a Redis.
+    """The store at `url`, for one ledger (chunk.ledger_id): "sqlite", in `file`, or a Redis.
 
     The bounds are on the rows as they travel; the one on all robots together is SQLite's alone, a Redis has its own
     maxmemory. read_only: nothing is made or changed; database.NothingThere where there is no store yet. StoreError.
@@ -19,5 +18,7 @@ def open_store(
     if url == "sqlite":
         from rosbridge_eth.log.sqlite import SqliteStore
 
-        return SqliteStore(home / "store.sqlite", ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
-    raise StoreError("[store] url: only \"sqlite\" is known")
+        return SqliteStore(file, ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
+    from rosbridge_eth.log.redis import RedisStore
+
+    return RedisStore(url, ledger, max_bytes, max_bytes_per_robot)

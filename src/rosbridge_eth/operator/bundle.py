@@ -121,13 +121,14 @@ def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
             check_name(name)
         if bundle.certificates.keys() != set(CERTIFICATE_FILES) or bundle.keys.keys() not in (set(), set(KEY_FILES)):
             raise ValueError
-        address = parse_address(bundle.end.server_address)
-        if not bundle.end.ledger or len(bundle.end.genesis + bundle.end.contract) != 66 + 42:
+        addresses = [parse_address(server) for server in bundle.end.servers]
+        if not addresses or not bundle.end.ledger or len(bundle.end.genesis + bundle.end.contract) != 66 + 42:
             raise ValueError
     except (ValueError, OverflowError):
         raise IdentityError("this bundle file was damaged") from None
-    if address.nowhere:
-        raise IdentityError(f"this bundle tells its robot to send to {address}, which is no machine's address")
+    for address in addresses:
+        if address.nowhere:
+            raise IdentityError(f"this bundle tells its robot to send to {address}, which is no machine's address")
     return bundle
 
 

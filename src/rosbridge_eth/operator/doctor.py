@@ -6,11 +6,7 @@ session that is tried is given back.
 
 from __future__ import annotations
 
-import errno
-import http.client
-import json as jsonlib
 import os
-import socket
 import sqlite3
 import stat
 import time
@@ -25,17 +21,15 @@ import typer
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
-from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_sockets
-from rosbridge_eth.config import Address, load_reader_config, load_robot_config, load_server_config
-from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
+from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
+from rosbridge_eth.config import Address, RobotConfig, load_reader_config, load_robot_config, load_server_config
+from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of, shard_of
 from rosbridge_eth.config.passphrases import passphrase_file, read_passphrase
-from rosbridge_eth.config.values import parse_address
-from rosbridge_eth.errors import BridgeError, IdentityError, NetworkError
+from rosbridge_eth.errors import BridgeError
 from rosbridge_eth.log.chunk import Log, robot_id
 from rosbridge_eth.log.database import InUse, NothingThere
-from rosbridge_eth.operator.bundle import needs_password, read_bundle
 from rosbridge_eth.operator.registry import Registry, differences
-from rosbridge_eth.operator.status import ANSWER_TIME, span
+from rosbridge_eth.operator.status import span
 from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.robot.sender import mend
@@ -57,13 +51,13 @@ class Finding(NamedTuple):
     """One thing that was tried: what was found, and the fix where something is to be done.
 
     result: "ok"; "note": it works, and will not for ever or not at its best; "broken"; "skipped": it could not be
-    tried, and `mend` says what it takes.
+    tried, and `fix` says what it takes.
     """
 
     result: str
     what: str
     found: str
-    mend: str = ""
+    fix: str = ""
 
 
 Home: TypeAlias = OperatorHome | RobotHome | ReaderHome
@@ -96,8 +90,8 @@ def examine(checks: Mapping[str, Check], home: Any, secret: bytes | None) -> Fin
 
 def clock(home: Home, secret: bytes | None) -> Findings:
     if not clock_synchronised():
-        yield note("clock", "the kernel does not hold it to be synchronised",
-                   "start systemd-timesyncd or chrony; records say that their time is not to be relied on")
+        yield note("clock", "not synchronised with a time server",
+                   "start systemd-timesyncd or chrony; until then records say that their time is not to be relied on")
     else:
         yield ok("clock", "synchronised")
 
@@ -133,65 +127,29 @@ def certificates(folder: Path, renewal: str) -> Findings:
     now = datetime.now(UTC)
     for path in sorted(folder.glob("*.crt.pem")):
         for each in ids.read_certificates(path.read_bytes()):
-            mend = "make a new home, with a new CA" if path.name == "ca.crt.pem" else renewal
+            fix = "make a new home, with a new CA" if path.name == "ca.crt.pem" else renewal
             if each.not_after < now:
-                yield broken("certificates", f"{path} expired on {each.not_after:%Y-%m-%d}", mend)
+                yield broken("certificates", f"{path} expired on {each.not_after:%Y-%m-%d}", fix)
             elif each.not_before > now:
                 yield broken("certificates", f"{path} begins on {each.not_before:%Y-%m-%d}", "set the clock")
             elif each.not_after - now < EXPIRY:
-                yield note("certificates", f"{path} expires in {(each.not_after - now).days} days", mend)
+                yield note("certificates", f"{path} expires in {(each.not_after - now).days} days", fix)
             else:
                 yield ok("certificates", f"{path.name} of {folder.name} until {each.not_after:%Y-%m-%d}")
 
 
-def near(address: Address) -> Address:
-    """Where a socket of this machine that listens there is reached from here."""
-    return address._replace(host={"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address.host, address.host))  # noqa: S104
+def process(home: Home, name: str, take_ports: Callable[[], object]) -> Findings:
+    """A process of this home that runs is ready; while it does not run its ports are free (else NetworkError)."""
+    from rosbridge_eth.server import metrics
 
-
-def monitor(address: Address | None, runs: bool) -> Findings:
-    """Is the port of /metrics free, or does the process that should have it answer there?"""
-    if address is None:
-        return
-    try:
-        if not runs:
-            socket.create_server(address, family=address.family).close()
-            yield ok("monitor", f"{address} is free")
-            return
-        with closing(http.client.HTTPConnection(*near(address), timeout=ANSWER_TIME)) as connection:
-            connection.request("GET", "/readyz")
-            conditions = dict[str, bool](jsonlib.loads(connection.getresponse().read())["conditions"])
-        if not conditions:
-            raise ValueError("no conditions")
-    except (OSError, http.client.HTTPException, ValueError, LookupError, TypeError) as error:
-        yield broken("monitor port", f"{address} is not answered by this home's process ({error})",
-                     "stop what has the port, or correct `monitor`; then start again")
-        return
-    if failing := [name for name, holds in conditions.items() if not holds]:
-        yield broken("monitor", f"{address} says not ready: {', '.join(failing)}", "see the log, and what is said here")
+    figures = metrics.running(home.path).get(name)
+    if figures is None:
+        take_ports()
+        yield ok(name, "does not run; its ports are free")
+    elif failing := metrics.failing(figures):
+        yield broken(name, f"runs and is not ready: {', '.join(failing)}", "see its log, and what is said here")
     else:
-        yield ok("monitor", f"{address} says ready")
-
-
-def shake_hands(
-    place: Address, identity: ids.Identity, trust: ids.Trust, server: str, mode: str, wall: Callable[[], datetime]
-) -> tuple[Connected | HandshakeFailed, int]:
-    """Try a session, and end it: how that went, and how many datagrams came back."""
-    sock, address = client_socket(place)
-    events, now = list[Event](), time.monotonic()
-    config = ClientConfig(mode=Mode[mode.upper()], attempt_timeout=ATTEMPT_TIME)
-    client = Client(config, identity, trust, server, now, wall=wall)
-    client.connect(address, now)
-    with closing(UdpLoop(client, sock, events.append)) as loop:
-        while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(each, Connected) for each in events):
-            loop.step(0.2)
-        client.close(time.monotonic())
-        loop.step(0.0)
-    ends = [event for event in events if isinstance(event, Connected | HandshakeFailed)]
-    # A session, else a refusal with its reason: one attempt may have lost what another was told.
-    best = min(ends, key=lambda end: (isinstance(end, HandshakeFailed), getattr(end, "hint", None) is None),
-               default=HandshakeFailed("no answer"))
-    return best, client.statistics()["datagrams_received"]
+        yield ok(name, "runs, and is ready")
 
 
 def chain(ledger: Ledger) -> Findings:
@@ -213,20 +171,8 @@ def chain(ledger: Ledger) -> Findings:
 
 
 def operator_configuration(home: OperatorHome, secret: bytes | None) -> Findings:
-    config = load_server_config(home.config)
-    yield ok("configuration", str(home.config))
-    robots = str(config.address_for_robots())
-    for bundle in sorted(home.bundles.glob("*.bundle")):
-        content = bundle.read_bytes()
-        try:
-            told = robots if needs_password(content) else read_bundle(content).end.server_address
-        except IdentityError as error:
-            yield note("bundle", f"{bundle}: {error}",
-                       f"where its robot has not joined yet: `register {bundle.stem} REQUEST --replace`")
-            continue
-        if told != robots:
-            yield note("bundle", f"{bundle.name} tells its robot to send to {told}, and `public` is {robots}",
-                       f'write server = "{robots}" into the robot.toml of who joined with it')
+    addresses = load_server_config(home.config).addresses()
+    yield ok("configuration", f"{home.config}; robots are told to send to {', '.join(map(str, addresses))}")
 
 
 def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -240,29 +186,18 @@ def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
     yield ok("passphrase", "opens the server's keys and the accounts")
 
 
-def door(home: OperatorHome, secret: bytes | None) -> Findings:
-    """The robots' UDP port is free, or a server answers there; the same of the monitor's."""
+def shards(home: OperatorHome, secret: bytes | None) -> Findings:
+    from rosbridge_eth.server import metrics
+    from rosbridge_eth.server.shard import name_of
+
     config = load_server_config(home.config)
-    try:
-        for sock in server_sockets(config.listen):
-            sock.close()
-        runs = False
-        yield ok("UDP port", f"{config.listen} is free: the server does not run")
-    except NetworkError as error:
-        if not isinstance(error.__cause__, OSError) or error.__cause__.errno != errno.EADDRINUSE:
-            raise
-        now = datetime.now(UTC)
-        ca = ids.create_ca("doctor", at=now)  # who is not let in is refused, but by a server
-        nobody, trust = ids.enrol(ca, ids.Role.ROBOT, "doctor", at=now), ids.Trust([ca.certificate])
-        place = near(config.listen)
-        end, _ = shake_hands(place, nobody, trust, config.name, config.channel[0], lambda: now)
-        runs = isinstance(end, HandshakeFailed) and end.hint is not None
-        if runs:
-            yield ok("UDP port", f"a server answers at {place}")
-        else:
-            yield broken("UDP port", f"{str(error).partition(';')[0]}, and what has it does not answer as servers do",
-                         f"stop it (`ss -ulpn sport = :{place.port}` names it), or choose another `listen`")
-    yield from monitor(config.monitor, runs)
+
+    def take_ports(shard: int) -> None:
+        server_socket(config.listen.next(shard)).close()
+        metrics.require_free(config.monitor and config.monitor.next(shard))
+
+    for shard in range(config.shards):
+        yield from process(home, name_of(shard), partial(take_ports, shard))
 
 
 def registry(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -271,19 +206,18 @@ def registry(home: OperatorHome, secret: bytes | None) -> Findings:
 
 
 def store(home: OperatorHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.server.supervisor import open_store
+    from rosbridge_eth.server.shard import open_store
 
     if not home.deployment_file.exists():
         yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home.path}`")
         return
-    try:
-        inbox = open_store(load_server_config(home.config), home, read_only=True)
-    except NothingThere:
-        yield ok("store", "there is none yet; the server makes it")
-        return
-    with closing(inbox):
-        inbox.check()
-        yield ok("store", f"{sum(inbox.waiting(tk).chunks for tk in inbox.sizes())} chunks wait")
+    config, waits, found = load_server_config(home.config), 0, "there is none yet; the server makes it"
+    for shard in range(config.shards):
+        with suppress(NothingThere), closing(open_store(config, home, shard, read_only=True)) as opened:
+            opened.check()
+            waits += sum(opened.waiting(tk).chunks for tk in opened.sizes() if shard_of(tk, config.shards) == shard)
+            found = f"{waits} chunks wait"
+    yield ok("store", found)
 
 
 def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
@@ -314,7 +248,7 @@ def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
 def bridge(home: RobotHome, secret: bytes | None) -> Findings:
     end, config = home.bridge(), load_robot_config(home.config)
     yield ok("configuration", str(home.config))
-    place = config.server or parse_address(end.server_address)
+    place = config.server or end.addresses()[0]
     if place.nowhere:
         yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
                      'write server = "HOST:PORT", as the server is reached, into robot.toml')
@@ -347,37 +281,58 @@ def source(home: RobotHome, secret: bytes | None) -> Findings:
 
 
 def session(home: RobotHome, secret: bytes | None) -> Findings:
-    """The spool, and a session with the server as the robot would make it; the server's time is compared with ours."""
-    end, config, runs = home.bridge(), load_robot_config(home.config), False
-    log, server = Log(end.ledger, robot_id(end.robot)), config.server or parse_address(end.server_address)
+    """The spool, and a session with the server as the robot would make it."""
+    from rosbridge_eth.server import metrics
+
+    end, config = home.bridge(), load_robot_config(home.config)
+    log, server = Log(end.ledger, robot_id(end.robot)), config.server or end.addresses()[0]
+    yield from process(home, "robot", lambda: metrics.require_free(config.monitor))
     try:
         Spool(home.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
         yield ok("spool", "opens")
     except NothingThere:
         yield ok("spool", "none yet; the first start makes it")
     except InUse:
-        runs = True
         yield ok("spool", "in use by the robot that runs")
-    yield from monitor(config.monitor, runs)
-    if secret is None or runs:
-        why = "a session would end that of the robot that runs" if runs else "it takes the robot's keys to be let in"
-        way = "see `status` of this home" if runs else "give --passphrase-file"
-        yield skipped("server", f"{server} not tried: {why}", way)
+        yield skipped("server", f"{server} not tried: a session would end that of the robot that runs",
+                      "see `status` of this home")
+        return
+    if secret is None:
+        yield skipped("server", f"{server} not tried: it takes the robot's keys to be let in", "give --passphrase-file")
         return
     identity, roots = ids.load_identity(home.identity, secret)
     yield ok("password", f"opens the keys of {identity.name}")
-    trust, wall = ids.Trust(roots), certificate_clock(home)
-    found, answers = shake_hands(server, identity, trust, end.server_name, config.channel, wall)
-    if isinstance(found, HandshakeFailed):
-        yield broken("server", f"{server}: {found.why}", mend(found, config.channel) if answers else (
-            f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between, and"
-            f' does it take channel = "{config.channel}" (`channel` in its server.toml)?'))
+    yield from try_session(home, config, identity, ids.Trust(roots), end.server_name, server)
+
+
+def try_session(
+    home: RobotHome, config: RobotConfig, identity: ids.Identity, trust: ids.Trust, name: str, server: Address
+) -> Findings:
+    """Make a session with the server and end it; the server's time is compared with ours."""
+    sock, address = client_socket(server)
+    events, now = list[Event](), time.monotonic()
+    settings = ClientConfig(mode=Mode[config.channel.upper()], attempt_timeout=ATTEMPT_TIME)
+    client = Client(settings, identity, trust, name, now, wall=certificate_clock(home))
+    client.connect(address, now)
+    with closing(UdpLoop(client, sock, events.append)) as loop:
+        while time.monotonic() < now + HANDSHAKE_TIME and not any(isinstance(each, Connected) for each in events):
+            loop.step(0.2)
+        client.close(time.monotonic())
+        loop.step(0.0)
+    failed = [event for event in events if isinstance(event, HandshakeFailed)]
+    for connected in (event for event in events if isinstance(event, Connected)):
+        yield ok("server", f"{server} made a session")
+        off = 0.0 if connected.server_time is None else time.time() - connected.server_time.timestamp()
+        if abs(off) > WRONG_CLOCK:
+            yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
+                         "set the one of the two that is wrong")
         return
-    yield ok("server", f"{server} made a session")
-    off = 0.0 if found.server_time is None else time.time() - found.server_time.timestamp()
-    if abs(off) > WRONG_CLOCK:
-        yield broken("clock", f"it is {span(abs(off))} {'ahead of' if off > 0 else 'behind'} the server's",
-                     "set the one of the two that is wrong")
+    # A refusal with its reason first: one attempt may have lost what another was told.
+    why = min(failed, key=lambda failure: failure.hint is None, default=HandshakeFailed("no answer"))
+    yield broken("server", f"{server}: {why.why}", mend(why, config.channel)
+                 if client.statistics()["datagrams_received"] else
+                 f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between,"
+                 f' and does it take channel = "{config.channel}" (`channel` in its server.toml)?')
 
 
 # A reader's folder
@@ -407,7 +362,7 @@ CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
         "certificates": lambda home, _: certificates(home.path / "ca", ""),
         "server's certificates": lambda home, _: certificates(
             home.server, f"run `renew --home {home.path}`, then start the server again"),
-        "passphrase": operator_passphrase, "UDP port": door, "registry": registry, "store": store,
+        "passphrase": operator_passphrase, "ports": shards, "registry": registry, "store": store,
         "node": operator_node,
     }),
     HomeKind.ROBOT: (RobotHome, _MACHINE | {
@@ -447,7 +402,7 @@ def doctor(
     for finding in examine(checks, of(home), secret):
         findings.append(finding)
         if not json and finding.result != "ok":
-            told = "; ".join(filter(None, (finding.found, finding.mend)))
+            told = "; ".join(filter(None, (finding.found, finding.fix)))
             talk(f"{_SIGN[finding.result]}: {finding.what}: {told}")
     count = sum(finding.result == "broken" for finding in findings)
     if json:

@@ -101,10 +101,9 @@ def init_home(
     require_empty(home.path)
     require_empty(reader.path)
     try:
-        door = parse_address(listen)
-        text = server_toml(
-            door, own_address(door) if public is None else parse_address(public), chain_url, server, passphrase_file,
-        )
+        address = parse_address(listen)
+        told = own_address(address) if public is None else parse_address(public)
+        text = server_toml(address, told, chain_url, server, passphrase_file)
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
     parse_config(ServerConfig, text, home.config)
@@ -338,7 +337,8 @@ def register_robot(
     if request and request.name != name:
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
     there = home.deployment()
-    end = BridgeEnd(name, config.name, str(config.address_for_robots()), there.chain_id, there.genesis, there.contract)
+    servers = [str(address) for address in config.addresses()]
+    end = BridgeEnd(name, config.name, servers, there.chain_id, there.genesis, there.contract)
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:
@@ -478,5 +478,5 @@ def revoke(
     except (ChainError, StoreError) as error:
         raise type(error)(
             f"half done: the server takes nothing from {name} any more, but chain or store did not follow ({error});"
-            f" run `revoke {name}` again when that is mended"
+            f" run `revoke {name}` again when they answer"
         ) from error

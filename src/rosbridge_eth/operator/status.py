@@ -18,7 +18,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from rosbridge_eth.config import ServerConfig, load_robot_config, load_server_config
-from rosbridge_eth.config.home import HomeKind, OperatorHome, RobotHome, kind_of
+from rosbridge_eth.config.home import HomeKind, OperatorHome, RobotHome, kind_of, shard_of
 from rosbridge_eth.config.values import counted
 from rosbridge_eth.errors import BridgeError, ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Role
@@ -31,6 +31,7 @@ from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, pla
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger import Ledger, Standing
+    from rosbridge_eth.server.metrics import Figure
 
 _WEI: Final = 10**18
 ANSWER_TIME = 5.0  # seconds for a node or a monitor
@@ -42,7 +43,6 @@ Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
 FEW_DAYS = 7.0
 FORKED_FOR = 600.0  # seconds for which it is told that a log went on in two places
-Figure = tuple[str, dict[str, str], float]
 _NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
 _SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
@@ -61,24 +61,21 @@ def _asking(report: Report, what: str) -> Iterator[None]:
         report["unknown"].append(f"{what}: {error}")
 
 
-def _running(report: Report, home: Path, otherwise: str, expected: Collection[str] = ()) -> list[Figure]:
-    """What the running processes of this home show; in the report, the conditions that do not hold.
+def _running(report: Report, home: Path, otherwise: str) -> list[Figure]:
+    """What the processes of this home show; in the report, those that were killed and the conditions that do not hold.
 
-    expected: the processes; of a server those that it has started. otherwise: said where none of them beats.
+    otherwise: said where none of them is there.
     """
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.supervisor import MONITOR
 
-    report["process"], found, holds = None, list[Figure](), dict[str, bool]()
-    with suppress(ValueError):  # nothing runs
-        found = metrics.figures(home)
-        expected = expected or {of["process"] for name, of, _ in found if name == "starts"} - {MONITOR}
-        holds.update(metrics.conditions(metrics.collected(home), expected, time.time()))
-    if not any(holds.get(f"{process} runs") for process in expected):  # or what a killed one left
+    found = metrics.running(home)
+    if not any(found.values()):
         report["unknown"].append(otherwise)
-        return []
-    report["process"] = [name for name, so in holds.items() if not so]
-    return found
+    report["process"] = [
+        failing for process, figures in found.items()
+        for failing in ([f"{process} runs"] if figures is None else metrics.failing(figures))
+    ] if found else None  # fmt: skip
+    return [figure for figures in found.values() for figure in figures or ()]
 
 
 def _add_figures(report: Report, figures: Collection[Figure]) -> None:
@@ -158,17 +155,19 @@ def fleet(place: OperatorHome) -> RenderableType:
 
 
 def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots: Mapping[bytes, Enrolment]) -> None:
-    from rosbridge_eth.server.supervisor import open_store
+    from rosbridge_eth.server.shard import open_store
 
-    names = {tk: robot.name for tk, robot in robots.items()}
-    with closing(open_store(config, place, read_only=True)) as inbox:
-        for tk in inbox.sizes():
-            waiting, [state] = inbox.waiting(tk), inbox.states([tk])
-            robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
-            oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
-            hold = state.hold if waiting.chunks or robot["in_force"] else ""
-            robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
-        reasons = Counter((letter.tk, letter.why) for letter in inbox.dead(DEAD))
+    names, reasons = {tk: robot.name for tk, robot in robots.items()}, Counter[tuple[bytes, str]]()
+    for shard in range(config.shards):
+        with suppress(NothingThere), closing(open_store(config, place, shard, read_only=True)) as store:
+            for tk in (each for each in store.sizes() if shard_of(each, config.shards) == shard):
+                waiting, [state] = store.waiting(tk), store.states([tk])
+                robot = report["robots"].setdefault(names.get(tk, tk.hex()), {"account": None, "in_force": False})
+                oldest = None if waiting.oldest is None else max(0.0, time.time() - waiting.oldest)
+                hold = state.hold if waiting.chunks or robot["in_force"] else ""
+                robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
+            reasons.update((letter.tk, letter.why) for letter in store.dead(DEAD)
+                           if shard_of(letter.tk, config.shards) == shard)
     report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
                       for (tk, why), count in reasons.items()]  # fmt: skip
 
@@ -250,7 +249,7 @@ def _alarms(report: Report) -> Iterator[str]:
 def _robot(place: RobotHome) -> Report:
     end, config = place.bridge(), load_robot_config(place.config)
     report: Report = {
-        "robot": end.robot, "server": f"{end.server_name} at {config.server or end.server_address}",
+        "robot": end.robot, "server": f"{end.server_name} at {config.server or end.addresses()[0]}",
         "topics": [topic.topic for topic in config.topics], "nodes": list(config.nodes),
         "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "alarms": [],
         "unknown": [],
@@ -262,7 +261,7 @@ def _robot(place: RobotHome) -> Report:
                 report["spool"] = spool.statistics()._asdict()
         except InUse:
             report["runs"] = True
-            running = _running(report, place.path, _SILENT, ["robot"])
+            running = _running(report, place.path, _SILENT)
             seen = [value for name, _, value in running if name == "forked_seconds"]
             report["alarms"] = [f"ALARM: {FORKED}" for value in seen if time.time() - value < FORKED_FOR]
             wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",

@@ -26,17 +26,17 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, parse_address, time_text
+from rosbridge_eth.config.values import Address, counted, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
 from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.logs import Trouble
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
 from rosbridge_eth.robot.spool import Spool
+from rosbridge_eth.terminal import Trouble
 from smcrypto import __version__, sm2, x509
 
 log = logging.getLogger(__name__)
@@ -68,11 +68,11 @@ class Robot:
     """One identity's process, run by `run` in the calling thread until its source ends or `stop` is called."""
 
     def __init__(
-        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client, server: Address,
-        sender: Sender, box: BlackBox | None = None,
+        self, *, source: Source, capture: Capture, writer: LogWriter, spool: Spool, client: Client,
+        servers: Sequence[Address], sender: Sender, box: BlackBox | None = None,
     ) -> None:  # fmt: skip
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
-        self.client, self.sender, self.loop = client, sender, ClientLoop(client, server, self.handle)
+        self.client, self.sender, self.loop = client, sender, ClientLoop(client, servers, self.handle)
         self.source, self.chunks = source, 0
         self.written = Counter[str]()
         """Records given to the writer, by topic."""
@@ -298,7 +298,7 @@ class Robot:
     def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
         """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
 
-        A spool may do one thing and not another: it is well again when all that it did not do is done.
+        A spool may do one thing and not another: it works again when all that it did not do is done.
         """
         try:
             given = call()
@@ -417,7 +417,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     sender = Sender(client, spool, writer, channel=config.channel, on_server_time=partial(keep_time, home))
     return Robot(
         source=source, capture=capture, writer=writer, spool=spool, client=client,
-        server=config.server or parse_address(end.server_address), sender=sender, box=box,
+        servers=[config.server] if config.server else end.addresses(), sender=sender, box=box,
     )
 
 

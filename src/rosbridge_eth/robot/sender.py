@@ -55,7 +55,7 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
                 " server's made anew (`renew`)"
             )
         case Reason.FULL:
-            return "wait, or ask the operator for more `workers` (server.toml)"
+            return "wait, or ask the operator for more `shards` (server.toml)"
         case _:
             return (
                 "is it up, is the address right, is UDP let through, and does it take"

@@ -1,33 +1,24 @@
-"""What the processes count, as Prometheus has it, and the HTTP server of /metrics, /healthz and /readyz.
+"""What the processes count, as Prometheus has it: served at /metrics, and saved where `status` finds it.
 
-A running server or robot has its figures in files of a folder in memory (`shared`, prometheus_client's multiprocess
-mode), to which its home leads: that is how the server's processes share them, and how `status` knows. The table of
-docs/operations.md has them all. The server is healthy while its processes beat, and ready when every condition holds,
-too.
+A shard of the server, and a robot, has its figures in its own memory; prometheus_client serves them on the port that
+`monitor` names. Every two seconds it saves them in a file of its home, too (`.shard-0.prom`, `.robot.prom`), which it
+removes at its end: a file that was not touched for SILENCE is of a process that was killed, or hangs. The table of
+docs/operations.md has all figures.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import os
 import shutil
 import socket
-import struct
-import tempfile
-import threading
 import time
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from typing import TYPE_CHECKING, Final
 
-from prometheus_client import CollectorRegistry, Gauge, values
-from prometheus_client.exposition import CONTENT_TYPE_LATEST, ThreadingWSGIServer, generate_latest
-from prometheus_client.multiprocess import MultiProcessCollector
+from prometheus_client import CollectorRegistry, Gauge, start_http_server, write_to_textfile
+from prometheus_client.parser import text_string_to_metric_families
 
 from rosbridge_eth.channel import Drop
 from rosbridge_eth.config.values import Address
@@ -41,24 +32,23 @@ if TYPE_CHECKING:
     from rosbridge_eth.server.reception import Worker
     from rosbridge_eth.server.submitter import Submitter
 
+EVERY: Final = 2.0  # seconds between two looks at what a process counted
 SILENCE: Final = 15.0  # seconds without a beat after which a process counts as hanging
-DEADLINE: Final = 10.0  # seconds for a client to send its request and take the answer
 LITTLE_ROOM: Final = 64 << 20  # bytes; below this the disk counts as full
 
 REGISTRY = CollectorRegistry()
-_ENVIRONMENT: Final = "PROMETHEUS_MULTIPROC_DIR"
-_LINK: Final = ".figures"  # in the home; leads to the folder
-_PREFIX: Final = "rosbridge-eth-"
+_PREFIX: Final = "rosbridge_eth_"
+Figure = tuple[str, dict[str, str], float]
 
 
 def _gauge(name: str, help: str, *labels: str) -> Gauge:
     # Without a label it would stand at 0 in every process that has nothing to say of it.
-    return Gauge(f"rosbridge_eth_{name}", help, labels, registry=REGISTRY, multiprocess_mode="mostrecent")
+    return Gauge(_PREFIX + name, help, labels, registry=REGISTRY)
 
 
 BEAT = _gauge("beat_seconds", "When the process last took a turn, seconds since 1970.", "process")
-STARTS = _gauge("starts", "How often the process was started since the server was.", "process")
-CONDITION = _gauge("condition", "1 while the condition holds; /readyz lists them.", "name")
+STARTS = _gauge("starts", "How often the shard was started since the server was.", "process")
+CONDITION = _gauge("condition", "1 while the condition holds.", "process", "name")
 CHANNEL = _gauge("channel", "Counts of the channel since the process began, by what was counted.", "process", "count")
 DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by reason.", "process", "reason")
 
@@ -81,8 +71,8 @@ HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` say
 ON_CHAIN = _gauge("chain_chunks", "Its chunks on the chain.", "robot")
 BLOCK = _gauge("chain_block", "The block that has the newest of them.", "robot")
 GAS = _gauge("gas", "Gas of the transactions sent for it since the submitter began.", "robot")
-SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "count")
-BALANCE = _gauge("treasury_eth", "Balance of the operator's account.", "process")
+SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "process", "count")
+BALANCE = _gauge("treasury_eth", "Balance of the operator's account, at shard 0.", "process")
 HEAD = _gauge("head_block", "Number of the node's latest block.", "process")
 HEAD_AGE = _gauge("head_age_seconds", "Age of that block by its own timestamp.", "process")
 DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the home is.", "process")
@@ -98,75 +88,87 @@ SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave
 CONNECTED = _gauge("connected", "1 while a session with the server stands.", "robot")
 
 
-@contextmanager
-def shared(home: Path) -> Iterator[None]:
-    """Inside, this process and those it forks count in files of a folder that `collected` finds by the home.
+# Where others see them
 
-    They are mapped into memory, and a process that writes to such a file on a full disk is killed: so not on a disk.
+
+@contextmanager
+def served(address: Address | None) -> Iterator[None]:
+    """Inside, /metrics answers at this address (None: nowhere). NetworkError if the port cannot be had.
+
+    Meant for the machine itself or a private network: whoever reaches the port reads names, balances and counts.
     """
-    link, before, known = home / _LINK, values.ValueClass, os.environ.get(_ENVIRONMENT)
-    shm = "/dev/shm"  # noqa: S108 - a folder of a new name, for this user alone
-    folder = tempfile.mkdtemp(prefix=_PREFIX, dir=shm if os.access(shm, os.W_OK) else None)
-    with suppress(OSError):  # a full disk; then `status` does not know the figures
-        if (old := link.resolve()).name.startswith(_PREFIX):  # left by a process that was killed
-            shutil.rmtree(old, ignore_errors=True)
-        link.unlink(missing_ok=True)
-        link.symlink_to(folder)
-    _forget()
-    os.environ[_ENVIRONMENT] = folder
-    values.ValueClass = values.MultiProcessValue()  # type: ignore[no-untyped-call]
+    if address is None:
+        yield
+        return
+    require_free(address)
+    http, _ = start_http_server(address.port, address.host, REGISTRY)
     try:
         yield
     finally:
-        values.ValueClass = before
-        os.environ.pop(_ENVIRONMENT)
-        if known is not None:
-            os.environ[_ENVIRONMENT] = known
-        _forget()
-        link.unlink(missing_ok=True)
-        shutil.rmtree(folder, ignore_errors=True)
+        http.shutdown()
+        http.server_close()
 
 
-def forget_process(pid: int | None) -> None:
-    """Drop the figures of a process that has ended: those of the next one begin anew, and the old ones are not true."""
-    for file in Path(os.environ[_ENVIRONMENT]).glob(f"*_{pid}.db"):
-        file.unlink()
+def require_free(address: Address | None) -> None:
+    """NetworkError if the port of /metrics cannot be had."""
+    try:
+        if address is not None:
+            socket.create_server(address, family=address.family).close()
+    except OSError as error:
+        raise NetworkError(f"TCP {address} cannot be opened: {error.strerror}; correct `monitor`") from error
 
 
-def _forget() -> None:
-    """A figure is kept where it was first set: let it be set anew."""
-    for gauge in set(REGISTRY._names_to_collectors.values()):
-        gauge.clear()  # type: ignore[attr-defined]
+def file_of(home: Path, process: str) -> Path:
+    return home / f".{process}.prom"
 
 
-class _Shared(MultiProcessCollector):
-    """What all processes show; reads again where a file is just made, and is empty for a moment, or just removed."""
-
-    def collect(self) -> Any:
-        for _ in range(20):
-            with suppress(struct.error, FileNotFoundError):
-                return super().collect()  # type: ignore[no-untyped-call]
-            time.sleep(0.05)  # its process is about to write it
-        raise ValueError("the figures of a process are cut off")
+def save(file: Path) -> None:
+    """For `status`. Where the disk is full, it shows at least that the process is there."""
+    try:
+        write_to_textfile(str(file), REGISTRY)
+    except OSError:
+        with suppress(OSError):
+            file.touch()
 
 
-def collected(home: Path | None = None) -> CollectorRegistry:
-    """The registry to show: of what runs with that home (ValueError where nothing does); without one, of all processes
-    where they share a folder, else of this one."""
-    if home is None and _ENVIRONMENT not in os.environ:
-        return REGISTRY
-    registry = CollectorRegistry()
-    _Shared(registry, None if home is None else home / _LINK)  # type: ignore[no-untyped-call]
-    return registry
+def parsed(text: str) -> list[Figure]:
+    """Name (without its prefix), labels and value of what /metrics shows."""
+    return [(sample.name.removeprefix(_PREFIX), sample.labels, sample.value)
+            for family in text_string_to_metric_families(text) for sample in family.samples]  # fmt: skip
 
 
-def figures(home: Path) -> list[tuple[str, dict[str, str], float]]:
-    """Name (without its prefix), labels and value of all that the process of that home shows; ValueError, as above.
+def running(home: Path) -> dict[str, list[Figure] | None]:
+    """The figures of every process of this home; None of one that was killed, or hangs."""
+    found: dict[str, list[Figure] | None] = {}
+    for file in sorted(home.glob(".*.prom")):
+        with suppress(OSError):  # it ends at this moment
+            alive = time.time() - file.stat().st_mtime <= SILENCE
+            found[file.stem.removeprefix(".")] = parsed(file.read_text()) if alive else None
+    return found
 
-    A figure of what is no more is NaN, and left out."""
-    samples = [sample for family in collected(home).collect() for sample in family.samples]
-    return [(sample.name.removeprefix("rosbridge_eth_"), sample.labels, sample.value) for sample in samples
-            if not math.isnan(sample.value)]  # fmt: skip
+
+def failing(figures: list[Figure]) -> list[str]:
+    """Of what a process shows, its parts that hang and the conditions that do not hold."""
+    beats = {labels["process"]: value for name, labels, value in figures if name == "beat_seconds"}
+    return [
+        *(f"{part} works" for part, beat in beats.items() if max(beats.values()) - beat > SILENCE),
+        *(f"{labels['process']}: {labels['name']}" for name, labels, value in figures
+          if name == "condition" and value != 1),
+    ]  # fmt: skip
+
+
+class Beats:
+    """Says at a steady pace that the figures are due."""
+
+    def __init__(self, every: float = EVERY, clock: Callable[[], float] = time.monotonic) -> None:
+        self._every, self._clock, self._next = every, clock, float("-inf")
+
+    def due(self) -> bool:
+        now = self._clock()
+        if now < self._next:
+            return False
+        self._next = now + self._every
+        return True
 
 
 class Rates:
@@ -185,102 +187,7 @@ class Rates:
 _STORED_RATES = Rates()
 
 
-def beat(process: str, wall: float) -> None:
-    BEAT.labels(process).set(wall)
-
-
-def conditions(registry: CollectorRegistry, expected: Collection[str], wall: float) -> Mapping[str, bool]:
-    """Of each expected process whether it beats, and of each condition whether it holds."""
-    found = {f"{process} runs": False for process in expected}
-    for family in registry.collect():
-        for sample in family.samples:
-            if sample.name == "rosbridge_eth_beat_seconds" and sample.labels["process"] in expected:
-                found[f"{sample.labels['process']} runs"] = wall - sample.value <= SILENCE
-            elif sample.name == "rosbridge_eth_condition":
-                found[sample.labels["name"]] = sample.value == 1
-    return found
-
-
-class _Handler(WSGIRequestHandler):
-    timeout = DEADLINE
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Nothing: what a client asked for is its own words."""
-
-
-class _Server(ThreadingWSGIServer):
-    """Threads without number are not had: a connection that is not done after DEADLINE is shut."""
-
-    def server_bind(self) -> None:
-        self._open: dict[socket.socket, float] = {}
-        super().server_bind()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        self._open[request] = time.monotonic() + DEADLINE
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        self._open.pop(request, None)
-        super().shutdown_request(request)
-
-    def service_actions(self) -> None:
-        now = time.monotonic()
-        for request, deadline in list(self._open.items()):
-            if now > deadline:
-                self._open.pop(request, None)
-                try:
-                    request.shutdown(socket.SHUT_RDWR)
-                except OSError:
-                    continue  # the client has gone by itself
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Nothing: a client went away."""
-
-
-class Web:
-    """Serves from threads of its own between `start` and `stop`. NetworkError if the port cannot be had.
-
-    Meant for the machine itself or a private network: whoever reaches the port reads names, balances and counts.
-    """
-
-    def __init__(self, address: Address, expected: Collection[str]) -> None:
-        self._expected = expected
-        server = type("_FamilyServer", (_Server,), {"address_family": address.family})
-        try:
-            self._http: WSGIServer = make_server(*address, self._answer, server, _Handler)
-        except OSError as error:
-            raise NetworkError(f"TCP {address} cannot be opened: {error.strerror}; correct `monitor`") from error
-        self.address = Address(address.host, self._http.server_port)
-
-    def start(self) -> None:
-        # Made only here: the server forks in between, and a thread made before that cannot be started after it (3.13).
-        threading.Thread(target=self._http.serve_forever, args=(0.2,), name="web", daemon=True).start()
-
-    def stop(self) -> None:
-        self._http.shutdown()
-        self._http.server_close()
-
-    def _answer(self, environ: Mapping[str, Any], start_response: Any) -> list[bytes]:
-        path, registry = environ["PATH_INFO"], collected()
-        status, body, kind = HTTPStatus.OK, b"", "application/json"
-        if environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
-            status = HTTPStatus.METHOD_NOT_ALLOWED
-        elif path == "/metrics":
-            body, kind = generate_latest(registry), CONTENT_TYPE_LATEST
-        elif path in ("/healthz", "/readyz"):
-            found = conditions(registry, self._expected, time.time())
-            if path == "/healthz":
-                found = {name: holds for name, holds in found.items() if name.endswith(" runs")}
-            status = HTTPStatus.OK if all(found.values()) else HTTPStatus.SERVICE_UNAVAILABLE
-            body = json.dumps({"ok": all(found.values()), "conditions": found}, indent=1).encode() + b"\n"
-        else:
-            status, body, kind = HTTPStatus.NOT_FOUND, b"/metrics /healthz /readyz\n", "text/plain"
-        headers = [("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store")]
-        start_response(f"{status.value} {status.phrase}", headers)
-        return [body]
-
-
-# What each process shows of itself, once a second
+# What each process shows of itself
 
 
 def show_channel(process: str, counted: Mapping[str, int], lost_sends: int) -> None:
@@ -290,9 +197,9 @@ def show_channel(process: str, counted: Mapping[str, int], lost_sends: int) -> N
 
 
 def show_worker(process: str, worker: Worker, wall: float) -> None:
-    """A worker's channel and sessions, and what became of the chunks that reached it."""
+    """A shard's channel and sessions, and what became of the chunks that reached it."""
     reception = worker.reception
-    beat(process, wall)
+    BEAT.labels(process).set(wall)
     show_channel(process, reception.server.statistics(), worker.loop.lost_sends)
     for outcome, count in reception.counts.items():
         CHUNKS.labels(process, outcome).set(count)
@@ -306,15 +213,14 @@ def show_worker(process: str, worker: Worker, wall: float) -> None:
             SESSION.labels(session.peer.name, address[0]).set(wall)
     for robot, at in reception.forked.items():
         FORKED.labels(robot).set(wall - time.monotonic() + at)
-    CONDITION.labels(f"{process} stores chunks").set(reception.trouble.why is None)
+    CONDITION.labels(process, "stores chunks").set(reception.trouble.why is None)
 
 
 def show_submitter(
-    submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
-) -> None:  # fmt: skip
+    process: str, submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+) -> None:
     """What waits for the chain, and whether it gets there. Raises StoreError."""
-    process = "submitter"
-    beat(process, wall)
+    BEAT.labels(f"{process} submitter").set(wall)
     for (tk, robot), state in zip(robots.items(), store.states([*robots]), strict=True):
         name, held = robot.name, store.waiting(tk)
         WAITING.labels(name).set(held.chunks)
@@ -326,7 +232,7 @@ def show_submitter(
             ON_CHAIN.labels(name).set(standing.chunks)
             BLOCK.labels(name).set(standing.data_block)
     for what, count in submitter.counts.items():
-        SUBMITTER.labels(what).set(count)
+        SUBMITTER.labels(process, what).set(count)
     if submitter.head is not None:
         HEAD.labels(process).set(submitter.head.number)
         HEAD_AGE.labels(process).set(max(0.0, wall - submitter.head.time))
@@ -334,20 +240,20 @@ def show_submitter(
         BALANCE.labels(process).set(submitter.operator_balance / WEI_PER_ETH)
     room = shutil.disk_usage(folder).free
     DISK_FREE.labels(process).set(room)
-    CONDITION.labels("node answers").set(submitter.trouble is None)
-    CONDITION.labels("chunks are confirmed").set(submitter.unconfirmed is None)
-    CONDITION.labels("treasury can pay").set(submitter.funds is None)
-    CONDITION.labels("disk has room").set(room >= LITTLE_ROOM)
+    for condition, holds in {
+        "node answers": submitter.trouble is None, "chunks are confirmed": submitter.unconfirmed is None,
+        "treasury can pay": submitter.funds is None, "disk has room": room >= LITTLE_ROOM,
+    }.items():  # fmt: skip
+        CONDITION.labels(process, condition).set(holds)
 
 
 def show_robot(name: str, robot: Robot, wall: float) -> None:
     """A robot's capture, spool and session. Raises StoreError."""
-    beat("robot", wall)
+    BEAT.labels("robot").set(wall)
     show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
     CAPTURED.labels(name).set(robot.captured)
-    for gone in {trigger for _, trigger in FIRED._metrics} - robot.box.triggers.keys():  # by a reload
-        for gauge in (FIRED, KEPT, KEPT_BYTES):
-            gauge.labels(name, gone).set(math.nan)
+    for gauge in (FIRED, KEPT, KEPT_BYTES):  # of triggers that a reload took away, too
+        gauge.clear()
     for trigger in robot.box.triggers.values():
         FIRED.labels(name, trigger.rule.name).set(trigger.fired)
         KEPT.labels(name, trigger.rule.name).set(len(trigger.ring))
@@ -362,6 +268,8 @@ def show_robot(name: str, robot: Robot, wall: float) -> None:
     CONNECTED.labels(name).set(robot.sender.connected)
     if robot.sender.forked:
         FORKED.labels(name).set(wall)
-    CONDITION.labels("robot has a session").set(robot.sender.connected)
-    CONDITION.labels("server's name has an address").set(robot.loop.resolved)
-    CONDITION.labels("spool takes chunks").set(robot.spool_trouble.why is None)
+    for condition, holds in {
+        "robot has a session": robot.sender.connected, "server's name has an address": robot.loop.resolved,
+        "spool takes chunks": robot.spool_trouble.why is None,
+    }.items():
+        CONDITION.labels("robot", condition).set(holds)

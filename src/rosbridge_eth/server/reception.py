@@ -29,7 +29,7 @@ from rosbridge_eth.identity import PeerIdentity
 from rosbridge_eth.log.chunk import Altered, Chunk, ChunkError, Forged, Log, robot_id, verify
 from rosbridge_eth.log.hop import FORKED, HopError, ServerState, decode_offer
 from rosbridge_eth.log.store import NO_DIGEST, Offer, Outcome, State, Store
-from rosbridge_eth.logs import Trouble
+from rosbridge_eth.terminal import Trouble
 
 log = logging.getLogger(__name__)
 

@@ -182,7 +182,7 @@ def test_a_mistake_in_robot_toml_is_told(text):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("workers = 0", "workers is 0; input should be greater than or equal to 1"),
+        ("shards = 0", "shards is 0; input should be greater than or equal to 1"),
         ("channel = []", "channel is empty"),
         ('channel = ["foo"]', "channel[0] is 'foo'; input should be 'exchange' or 'transport'"),
         ('[chain]\ncontract = "0x12"', "unknown key 'contract' in chain; allowed: "),
@@ -260,12 +260,27 @@ def test_a_mistake_in_reader_toml_is_told(text, sentence):
 @pytest.mark.parametrize("text", ["", 'listen = "127.0.0.1:0"', 'listen = "[::]:7410"', 'public = "0.0.0.0:7410"'])
 def test_robots_are_never_given_an_address_that_is_none(text):
     with pytest.raises(ConfigError, match='public = "HOST:PORT"'):
-        server(text).address_for_robots()
+        server(text).addresses()
 
 
 def test_robots_are_given_the_public_address_or_the_one_that_is_listened_on():
-    assert server('public = "robots.example:7410"').address_for_robots() == ("robots.example", 7410)
-    assert server('listen = "192.0.2.7:7410"').address_for_robots() == ("192.0.2.7", 7410)
+    assert server('public = "robots.example:7410"').addresses() == [("robots.example", 7410)]
+    assert server('listen = "192.0.2.7:7410"').addresses() == [("192.0.2.7", 7410)]
+
+
+def test_each_shard_has_the_next_port_or_an_address_of_its_own():
+    next_ones = server('listen = "192.0.2.7:7410"\nshards = 3').addresses()
+    assert next_ones == [("192.0.2.7", 7410), ("192.0.2.7", 7411), ("192.0.2.7", 7412)]
+    assert server('shards = 2\npublic = ["a.example:7410", "b.example:9"]').addresses()[1] == ("b.example", 9)
+
+
+@pytest.mark.parametrize("text", [
+    'shards = 3\npublic = ["a.example:7410", "b.example:7411"]', 'shards = 2\nlisten = "127.0.0.1:65535"',
+    'shards = 2\nlisten = "127.0.0.1:0"', 'shards = 2\nmonitor = "127.0.0.1:65535"',
+])  # fmt: skip
+def test_every_shard_needs_ports_and_an_address(text):
+    with pytest.raises(ConfigError, match="shards"):
+        server(text)
 
 
 def sections(root):

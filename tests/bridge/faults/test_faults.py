@@ -17,7 +17,7 @@ import pytest
 import faults
 from conftest import unavailable
 
-IN_SEVERAL = {"robot", "worker", "submitter", "network"}
+IN_SEVERAL = {"robot", "shard", "network"}
 CHOSEN = [name for name in faults.FAULTS if os.environ.get("FAULTS") == "all" or name not in IN_SEVERAL]
 SEED = int(os.environ.get("FAULTS_SEED") or random.SystemRandom().randrange(1 << 31))
 ROUNDS = int(os.environ.get("FAULTS_ROUNDS", "1"))

@@ -70,7 +70,7 @@ def test_without_a_default_route_another_interface_is_found_and_last_the_loopbac
 
 @pytest.mark.parametrize("change", [
     {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"}, {"server": "My Server"},
-    {"chain_url": 'http://x"\nworkers = 3\n#'},
+    {"chain_url": 'http://x"\nshards = 3\n#'},
 ])
 def test_what_cannot_be_a_configuration_is_refused_before_anything_is_made(
     change: dict[str, str], tmp_path: Path
@@ -204,7 +204,7 @@ def test_a_backup_of_a_home_in_use_is_a_home(world: World, tmp_path: Path) -> No
     world.hand_over(2)
     admin.backup(world.home.path, tmp_path / "copy")
     copy = OperatorHome(tmp_path / "copy").require()
-    assert (copy.path / "store.sqlite").stat().st_mode & 0o777 == 0o600
+    assert (copy.path / "store-0.sqlite").stat().st_mode & 0o777 == 0o600
     with registry_of(copy) as known:
         assert [*known.robots()] == [TK]
     assert load_ca(copy.ca, PASSPHRASE, NOW)
@@ -368,7 +368,7 @@ def test_a_robot_with_its_own_keys_is_registered_and_nothing_secret_is_in_its_bu
     assert world.ledger.balance(made.account) == 5 * 10**17
     with registry(world) as known:
         assert known.robots()[TK].hash == standing.certificates_hash and known.allows(peer)
-    assert robot.bridge().server_address == "127.0.0.1:7410" and robot.bridge().ledger == world.ledger.ledger
+    assert robot.bridge().servers == ["127.0.0.1:7410"] and robot.bridge().ledger == world.ledger.ledger
 
 
 def test_easy_register_makes_the_keys_and_seals_them_under_the_password(world: World) -> None:
@@ -497,7 +497,7 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
             with pytest.raises(ChainError, match=r"half done: .* run `revoke robot_1` again"):
                 world.revoke()
     with monkeypatch.context() as patched:
-        patched.setattr(world, "open_store", partial(open_store, "redis://127.0.0.1:9", home=world.home.path,
+        patched.setattr(world, "open_store", partial(open_store, "redis://127.0.0.1:9", file=world.home.path,
                                                      ledger=bytes(32), max_bytes=1, max_bytes_per_robot=1))
         with pytest.raises(StoreError, match=r"half done: .* run `revoke robot_1` again"):
             world.revoke()

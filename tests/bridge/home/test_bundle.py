@@ -30,7 +30,7 @@ from rosbridge_eth.robot.loop import reader_keys
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 CA, OTHER_CA = (ids.create_ca("CA", at=NOW - timedelta(days=1000)) for _ in range(2))
 READER = ids.enrol(CA, Role.READER, "owner", at=NOW).public
-END = BridgeEnd("robot_1", "server", "192.0.2.7:7410", 31337, "0x" + "11" * 32, "0x" + "22" * 20)
+END = BridgeEnd("robot_1", "server", ["192.0.2.7:7410"], 31337, "0x" + "11" * 32, "0x" + "22" * 20)
 
 
 def answer(
@@ -129,8 +129,8 @@ def test_keys_that_are_certified_anew_join_again_and_another_ledger_does_not(hom
     request = ask_to_join(home, "robot_1", b"robot's")
     join(home, answer(request))
     home.config.write_text('topics = ["/mine"]\n')
-    join(home, answer(request, end=replace(END, server_address="192.0.2.8:7410")))
-    assert home.bridge().server_address == "192.0.2.8:7410" and "/mine" in home.config.read_text()
+    join(home, answer(request, end=replace(END, servers=["192.0.2.8:7410"])))
+    assert home.bridge().servers == ["192.0.2.8:7410"] and "/mine" in home.config.read_text()
     with pytest.raises(ConfigError, match="another ledger"):
         join(home, answer(request, end=replace(END, chain_id=1)))
 
@@ -181,12 +181,13 @@ def test_a_request_that_was_altered_is_refused() -> None:
     {"end": {}}, {"end": 5}, {"readers": {"../x": "pem"}}, {"certificates": 7}, {"keys": None}, {"readers": [5]},
     {"readers": {"owner": 5}}, {"certificates": {"sign.crt.pem": 5}}, {"keys": {"sign.key.pem": None}},
     {"end": asdict(END) | {"genesis": "0x1"}}, {"end": asdict(END) | {"chain_id": "one"}},
-    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"server_address": None}}, {"signature": 7},
+    {"end": asdict(END) | {"contract": 7}}, {"end": asdict(END) | {"servers": None}},
+    {"end": asdict(END) | {"servers": []}}, {"signature": 7},
     {"end": asdict(END) | {"contract": "0x" + "22 " * 20}}, {"end": asdict(END) | {"server_name": "a\x1b[2Jb"}},
-    {"end": asdict(END) | {"server_name": "\u202eb"}}, {"end": asdict(END) | {"server_address": "\x1b[2J:7410"}},
-    *({"end": asdict(END) | {"server_address": f"{host}:7410"}} for host in (
+    {"end": asdict(END) | {"server_name": "\u202eb"}}, {"end": asdict(END) | {"servers": ["\x1b[2J:7410"]}},
+    *({"end": asdict(END) | {"servers": ["192.0.2.7:7410", f"{host}:7410"]}} for host in (
         "0.0.0.0", "[::]", "0", "0x0", "00.00.0.0", "[::0]", "[0:0:0:0:0:0:0:0]", "[::ffff:0.0.0.0]", "[::ffff:0:0]")),
-    {"end": asdict(END) | {"server_address": "192.0.2.7:0"}},
+    {"end": asdict(END) | {"servers": ["192.0.2.7:0"]}},
 ])
 def test_a_bundle_that_was_damaged_is_refused(change: dict[str, object]) -> None:
     bundle = answer(Request.make("robot_1", *(ids.sm2.PrivateKey.generate() for _ in range(2))))
@@ -213,7 +214,7 @@ def test_a_reader_who_is_added_to_a_bundle_on_its_way_is_refused(home: RobotHome
     changes: list[dict[str, object]] = [
         {"readers": {"owner": owner, "revoked": revoked}}, {"readers": {"owner": revoked}}, {"readers": {}},
         {"signature": ""}, {"signature": "00" * 64}, {"signature": "zz"}, {"signature": bundle.signature[2:]},
-        {"end": asdict(replace(END, server_address="192.0.2.66:7410"))}, {"end": asdict(replace(END, chain_id=5))},
+        {"end": asdict(replace(END, servers=["192.0.2.66:7410"]))}, {"end": asdict(replace(END, chain_id=5))},
     ]
     for change in changes:
         with pytest.raises(IdentityError, match="not what the CA signed"):

@@ -62,7 +62,7 @@ class World:
 
     def open_store(self) -> Store:
         return open_store(
-            "sqlite", home=self.home.path, ledger=self.ledger.ledger, max_bytes=2**28, max_bytes_per_robot=2**26
+            "sqlite", file=self.home.store(0), ledger=self.ledger.ledger, max_bytes=2**28, max_bytes_per_robot=2**26
         )
 
     def request(self, name: str = "robot_1") -> Request:

@@ -12,8 +12,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
 
+from bridge.redis_server import RedisClusterServer, RedisServer
 from rosbridge_eth.log.opening import open_store
 from rosbridge_eth.log.store import Store
+from smcrypto import sm3
 
 PLENTY = 1 << 30
 
@@ -65,4 +67,33 @@ class SqliteBackend(Backend):
             copy.backup(file)
 
 
-BACKENDS: dict[str, type[Backend]] = {"sqlite": SqliteBackend}
+class RedisBackend(Backend):
+    bounded = False
+    server = "redis_server"
+
+    def __init__(self, folder: Path, fixture: Callable[[str], Any]) -> None:
+        self._server: RedisServer | RedisClusterServer = fixture(self.server)
+        self.folder, self.ledger = folder, sm3.digest(str(folder).encode())
+        self.url = self._server.url
+
+    def copy(self) -> dict[bytes, bytes]:
+        with self._server.client() as client:
+            return {key: client.dump(key) for key in self._keys(client)}
+
+    def put_back(self, copy: dict[bytes, bytes] | None) -> None:
+        """By DUMP and RESTORE of every key."""
+        with self._server.client() as client:
+            for key in self._keys(client):
+                client.delete(key)
+            for key, content in (copy or {}).items():
+                client.restore(key, 0, content)
+
+    def _keys(self, client: Any) -> list[bytes]:
+        return list(client.scan_iter(f"rosbridge-eth:3:{self.ledger.hex()}:*", count=10_000))
+
+
+class ClusterBackend(RedisBackend):
+    server = "redis_cluster"
+
+
+BACKENDS: dict[str, type[Backend]] = {"sqlite": SqliteBackend, "redis": RedisBackend, "cluster": ClusterBackend}

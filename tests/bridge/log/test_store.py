@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from web3 import Web3
 
 from bridge.chunks import chain, chunk, dropped
-from bridge.log.backends import BACKENDS, PLENTY, Backend
+from bridge.log.backends import BACKENDS, PLENTY, Backend, ClusterBackend
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk
 from rosbridge_eth.log.store import (
@@ -551,7 +551,8 @@ class Model(RuleBasedStateMachine):
 
 
 def test_any_sequence_of_calls_agrees_with_plain_lists(backend):
+    examples = settings.default.max_examples // (5 if isinstance(backend, ClusterBackend) else 1)
     run_state_machine_as_test(
         lambda: Model(backend),
-        settings=settings(stateful_step_count=15, suppress_health_check=[HealthCheck.too_slow]),
+        settings=settings(max_examples=examples, stateful_step_count=15, suppress_health_check=[HealthCheck.too_slow]),
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.channel.udp import UdpLoop, server_sockets
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.config import Address, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import load_ca
@@ -21,8 +21,9 @@ from rosbridge_eth.log.store import Store
 from rosbridge_eth.operator import enrolment as admin
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
 from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.server import metrics
 from rosbridge_eth.server.reception import Worker
-from rosbridge_eth.server.supervisor import open_reception, open_store
+from rosbridge_eth.server.shard import open_reception, open_store
 
 PASSPHRASE, PASSWORD, READERS = b"the operator's own words", b"the robot's own words", b"the reader's own words"
 NODE = "http://user:node-key@127.0.0.1:9/v1/path-key?token=query-key"
@@ -56,6 +57,13 @@ class Place:
         text = self.operator.config.read_text()
         assert old in text
         self.operator.config.write_text(text.replace(old, new))
+
+
+@pytest.fixture(autouse=True)
+def _nothing_counted() -> None:
+    """The figures of a process, which are those of one test here."""
+    for gauge in set(metrics.REGISTRY._names_to_collectors.values()):
+        gauge.clear()  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="session")
@@ -100,10 +108,9 @@ def keys(place: Place) -> Keyring:
 def server(place: Place) -> Iterator[Address]:
     """A real worker at a real port, its loop in a thread; the robot's home knows the address."""
     config, registry = load_server_config(place.operator.config), Registry(place.operator.registry)
-    [sock] = server_sockets(config.listen)
+    sock = server_socket(config.listen)
     reception = open_reception(
-        0, config, admin.load_server_identity(place.operator, PASSPHRASE), place.operator, registry, place.inbox(),
-        place.operator.deployment(),
+        config, admin.load_server_identity(place.operator, PASSPHRASE), place.operator, registry, place.inbox()
     )
     worker, stop = Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), threading.Event()
     thread = threading.Thread(target=worker.run, args=(stop.is_set,))

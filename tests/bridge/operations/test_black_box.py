@@ -197,10 +197,8 @@ def running(home: RobotHome, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def fired(home: RobotHome) -> dict[str, float]:
-    try:
-        return {of["trigger"]: value for name, of, value in metrics.figures(home.path) if name == "trigger_fired"}
-    except ValueError:
-        return {}
+    figures = metrics.running(home.path).get("robot") or []
+    return {of["trigger"]: value for name, of, value in figures if name == "trigger_fired"}
 
 
 def test_a_signal_and_the_command_are_events(
@@ -258,12 +256,14 @@ def test_a_trigger_that_is_gone_after_a_reload_has_no_figures(robot: RobotHome):
     topics = 'topics = [{topic = "/robot_1/odom", trigger = "crash"}, {topic = "/robot_1/imu", trigger = "NAME"}]\n'
     robot.config.write_text(f'{topics.replace("NAME", "fall")}{one}[[trigger]]\nname = "fall"\n')
     made = open_robot(robot, load_robot_config(robot.config), PASSWORD)
-    with closing(made.spool), closing(made.loop), metrics.shared(robot.path):
+    with closing(made.spool), closing(made.loop):
         metrics.show_robot("robot_1", made, 1.0)
         robot.config.write_text(topics.replace("NAME", "crash") + one)
         made.take_up(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
         metrics.show_robot("robot_1", made, 2.0)
-        named = {labels["trigger"] for _, labels, _ in metrics.figures(robot.path) if "trigger" in labels}
+        metrics.save(metrics.file_of(robot.path, "robot"))
+        figures = metrics.running(robot.path)["robot"] or []
+        named = {labels["trigger"] for _, labels, _ in figures if "trigger" in labels}
     assert named == {"crash"}, "`trigger` asks for those that there are"
 
 

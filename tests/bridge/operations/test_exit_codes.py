@@ -109,12 +109,12 @@ from pathlib import Path
 from rosbridge_eth.server import metrics
 from rosbridge_eth.config.home import RobotHome
 place = RobotHome(Path("robot"))
-with metrics.shared(place.path):
-    metrics.FIRED.labels("robot_1", "crash").set(0)
-    print("up", flush=True)
-    while not place.event("crash").exists():
-        time.sleep(0.02)
-    place.event("crash").unlink()
+metrics.FIRED.labels("robot_1", "crash").set(0)
+metrics.save(metrics.file_of(place.path, "robot"))
+print("up", flush=True)
+while not place.event("crash").exists():
+    time.sleep(0.02)
+place.event("crash").unlink()
 """
     running = subprocess.Popen([sys.executable, "-c", program], cwd=place.path, stdout=subprocess.PIPE)
     assert running.stdout is not None and running.stdout.readline() == b"up\n"

@@ -1,4 +1,4 @@
-"""One event is one line; nobody's words make a line of their own, no secret gets out; what is well again is said."""
+"""One event is one line; nobody's words make a line of their own, no secret gets out; what is works again is said."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.logs import LogFormat, Trouble, log_to_stderr, speaks_json
+from rosbridge_eth.terminal import LogFormat, Trouble, log_to_stderr, speaks_json
 
 log = logging.getLogger("rosbridge_eth.server.reception")
 
@@ -115,5 +115,5 @@ def test_trouble_is_said_at_each_change_and_so_is_its_end():
         trouble.now(why)
         assert trouble.why == why
     said = [line.partition("server.reception: ")[2] for line in stream.getvalue().splitlines()]
-    assert said == ["the node: no answer", "the node: too slow", "the node: well again", "the node: no answer",
-                    "the node: well again"]  # fmt: skip
+    assert said == ["the node: no answer", "the node: too slow", "the node: works again", "the node: no answer",
+                    "the node: works again"]  # fmt: skip

@@ -256,7 +256,7 @@ def site(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]
         for _ in range(2):  # run again, it finds what is there
             made.do("sh", str(script), environment=words)
         made.start("server", ["rosbridge-eth", *SERVICES["server"]["command"]])
-        made.until("the server is ready", lambda: made.get("monitor", "/readyz"))
+        made.until("the server is ready", lambda: made.get("monitor", "/metrics"))
         made.do("rosbridge-eth", "join", "--name", "robot_1", "--source", "sim", "--topic", "/robot_1/odom")
         request = (made.path / "robot/request.json").read_text()
         made.do("rosbridge-eth", "register", "robot_1", "/dev/stdin", given=request)

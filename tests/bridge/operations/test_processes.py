@@ -60,6 +60,7 @@ class Bridge:
     anvil: Anvil
     server: subprocess.Popen[bytes] | None = None
     environment: dict[str, str] = field(default_factory=dict)
+    shards: int = 2
 
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "rosbridge_eth", *arguments]
@@ -77,7 +78,7 @@ class Bridge:
                                     env=self.environment, stderr=stream)  # fmt: skip
 
     def start_server(self) -> None:
-        self.server = self.start("server.log", "server", "--workers", "2", "--passphrase-file", "pass")
+        self.server = self.start("server.log", "server", "--passphrase-file", "pass")
 
     def start_robot(self, source: str, more: str = "") -> subprocess.Popen[bytes]:
         (self.path / "robot/robot.toml").write_text(f'topics = ["/robot_1/odom"]\n{more}[source]\n{source}\n')
@@ -96,11 +97,20 @@ class Bridge:
             time.sleep(0.2)
         raise AssertionError(f"{what} within {PATIENCE:.0f} s; figures: {self.figures()}")
 
-    def ready(self) -> bool:
-        return ask(self.monitor, "/readyz")[0] == 200
+    def failing(self) -> list[str]:
+        failing: list[str] | None = json.loads(self.do("status", "--json").stdout)["process"]
+        return ["it does not run"] if failing is None else failing
 
-    def figures(self) -> dict[str, float]:
-        return figures_at(self.monitor)
+    def ready(self) -> bool:
+        return self.failing() == []
+
+    def figures(self, shard: int | None = None) -> dict[str, float]:
+        """Of a shard, or sums over all."""
+        found: dict[str, float] = {}
+        for each in range(self.shards) if shard is None else [shard]:
+            for key, value in figures_at(self.monitor + each).items():
+                found[key] = found.get(key, 0) + value
+        return found
 
     def events(self, log: str) -> list[dict[str, object]]:
         return [json.loads(line) for line in (self.path / log).read_text().splitlines()]
@@ -118,19 +128,18 @@ class Bridge:
 def _bridge(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]) -> Iterator[Bridge]:
     require("npx")
     path, node, udp, monitor = (
-        tmp_path_factory.mktemp("processes"), free_port(), free_port(socket.SOCK_DGRAM),
-        free_port(),
+        tmp_path_factory.mktemp("processes"), free_port(), free_port(socket.SOCK_DGRAM, 4), free_port(count=4),
     )
     made = Bridge(path, node, monitor, Anvil.start(node, state=path / "chain.json"))
     made.environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    made.environment.pop("PROMETHEUS_MULTIPROC_DIR", None)
     try:
         for name, words in (("pass", PASSPHRASE), ("word", PASSWORD), ("readers", READERS)):
             (path / name).write_text(words)
         made.do("init", "--listen", f"127.0.0.1:{udp}", "--chain", f"http://127.0.0.1:{node}",
                 "--passphrase-file", "pass", "--reader-passphrase-file", "readers")
         config = path / "operator" / "server.toml"
-        config.write_text(config.read_text().replace("[chain]", f'monitor = "127.0.0.1:{monitor}"\n\n[chain]'))
+        more = f'monitor = "127.0.0.1:{monitor}"\nshards = 2\n\n[chain]'
+        config.write_text(config.read_text().replace("[chain]", more))
         made.anvil.fund(OperatorHome(path / "operator").account, 1000)
         made.do("deploy", "--wait", "60", "--passphrase-file", "pass")
         made.do("join", "--name", "robot_1", "--password-file", "word")
@@ -158,9 +167,10 @@ def test_the_figures_of_a_run_are_those_of_the_run(bridge: Bridge):
     assert figures["chunks stored"] == report["robots"]["robot_1"]["chunks"] > 0
     assert figures["channel handshakes"] == 1
     assert figures["on_hold robot_1"] == figures["waiting_bytes robot_1"] == figures["waiting_seconds robot_1"] == 0
-    assert figures["treasury_eth"] == pytest.approx(report["operator"]["eth"], abs=1)
+    assert bridge.figures(0)["treasury_eth"] == pytest.approx(report["operator"]["eth"], abs=1)
     assert report["process"] == []
-    bridge.until("the last block", lambda: bridge.figures()["head_block"] == report["node"]["block"])
+    assert "treasury_eth" not in bridge.figures(1), "the first shard alone pays"
+    bridge.until("the last block", lambda: bridge.figures(1)["head_block"] == report["node"]["block"])
 
 
 def test_logs_at_their_most_talkative_name_every_chunk_and_betray_nothing(bridge: Bridge):
@@ -185,7 +195,6 @@ def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: B
     port = free_port()
     robot = bridge.start_robot('kind = "sim"', f'monitor = "127.0.0.1:{port}"\n')
     try:
-        bridge.until("ready", lambda: ask(port, "/readyz")[0] == 200)
         bridge.until("captured", lambda: figures_at(port)["captured robot_1"] > 10)
         assert figures_at(port)["connected robot_1"] == 1
         assert "treasury_eth" not in figures_at(port), "a robot says nothing of what the server knows"
@@ -193,7 +202,8 @@ def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: B
         assert json.loads(bridge.do("status", "--json").stdout)["robots"]["robot_1"]["address"] == "127.0.0.1"
         assert json.loads(bridge.do("status", "--home", "robot", "--json").stdout)["figures"]["connected"] == 1
         findings = json.loads(bridge.do("doctor", "--passphrase-file", "pass", "--json").stdout)["findings"]
-        assert next(f["found"] for f in findings if f["what"] == "UDP port").startswith("a server answers")
+        ports = [f["found"].startswith("a server answers") for f in findings if f["what"] == "UDP port"]
+        assert ports == [True, True]
         findings = json.loads(bridge.do("doctor", "--home", "robot", "--json").stdout)["findings"]
         assert {f["what"]: f["result"] for f in findings}["server"] == "skipped"
         assert {f["what"]: f["result"] for f in findings}["monitor"] == "ok"
@@ -207,84 +217,85 @@ def test_a_robot_shows_itself_in_one_process_and_is_seen_by_the_server(bridge: B
     assert verdict["sound"] and verdict["head"]["goodbye"]
 
 
-def test_a_killed_worker_is_started_again_and_counted(bridge: Bridge):
+def test_a_killed_shard_is_told_started_again_and_counted(bridge: Bridge):
     bridge.until("ready", bridge.ready)
-    before = bridge.figures()["starts"]
-    os.kill(bridge.pid("worker-1"), signal.SIGKILL)
-    bridge.until("counted", lambda: bridge.figures()["starts"] == before + 1)
-    bridge.until("up again", bridge.ready)
-    assert bridge.said("server.log", "worker-1 ended with exit code -9") == 1
-
-
-def test_a_worker_that_hangs_makes_it_unhealthy(bridge: Bridge):
-    bridge.until("ready", bridge.ready)
-    worker = bridge.pid("worker-0")
-    os.kill(worker, signal.SIGSTOP)
+    before = bridge.figures(1)["starts"]
+    assert bridge.server is not None
+    bridge.server.send_signal(signal.SIGSTOP)  # the parent does not start it again meanwhile
     try:
-        bridge.until("unhealthy", lambda: ask(bridge.monitor, "/healthz")[0] == 503)
-        assert json.loads(ask(bridge.monitor, "/healthz")[1])["conditions"]["worker-0 runs"] is False
+        os.kill(bridge.pid("shard-1"), signal.SIGKILL)
+        bridge.until("told", lambda: "shard-1 runs" in bridge.failing())
+        assert "shard-0 runs" not in bridge.failing()
     finally:
-        os.kill(worker, signal.SIGCONT)
+        bridge.server.send_signal(signal.SIGCONT)
+    bridge.until("counted", lambda: bridge.figures(1)["starts"] == before + 1)
+    bridge.until("up again", bridge.ready)
+    assert bridge.said("server.log", "shard-1 ended with exit code -9") == 1
+
+
+def test_a_shard_that_hangs_is_told(bridge: Bridge):
+    bridge.until("ready", bridge.ready)
+    shard = bridge.pid("shard-0")
+    os.kill(shard, signal.SIGSTOP)
+    try:
+        bridge.until("told", lambda: bridge.failing() == ["shard-0 runs"])
+    finally:
+        os.kill(shard, signal.SIGCONT)
     bridge.until("ready again", bridge.ready)
 
 
-def test_a_node_that_is_away_makes_it_unready_but_not_unhealthy_and_its_return_is_logged(bridge: Bridge):
+def test_a_node_that_is_away_is_told_and_so_is_its_return(bridge: Bridge):
     bridge.until("ready at first", bridge.ready)
     bridge.anvil.stop()
-
-    def blames_the_node() -> bool:
-        status, body = ask(bridge.monitor, "/readyz")
-        return status == 503 and json.loads(body)["conditions"]["node answers"] is False
-
-    bridge.until("unready", blames_the_node)
-    assert ask(bridge.monitor, "/healthz")[0] == 200
+    bridge.until("told", lambda: bridge.failing() == ["shard-0: node answers", "shard-1: node answers"])
     report = json.loads(bridge.do("status", "--json").stdout)
-    assert report["process"] == ["node answers"] and report["node"] is None
+    assert report["node"] is None
     bridge.start_anvil()
     bridge.until("ready again", bridge.ready)
-    bridge.until("said so", lambda: bridge.said("server.log", "the node: well again") == 1)
-    assert bridge.said("server.log", "the node: http://127.0.0.1") >= 1
+    bridge.until("said so", lambda: bridge.said("server.log", "the node: works again") == 2)
+    assert bridge.said("server.log", "the node: http://127.0.0.1") >= 2
 
 
-def test_a_submitter_that_starts_while_the_node_is_away_waits_for_it(bridge: Bridge):
+def test_a_shard_that_starts_while_the_node_is_away_waits_for_it(bridge: Bridge):
     bridge.until("ready at first", bridge.ready)
     bridge.anvil.stop()
-    before = bridge.figures()["starts"]
-    os.kill(bridge.pid("submitter"), signal.SIGKILL)
-    bridge.until("started again", lambda: bridge.figures()["starts"] > before)
+    before = bridge.figures(0)["starts"]
+    os.kill(bridge.pid("shard-0"), signal.SIGKILL)
+    bridge.until("started again", lambda: bridge.figures(0)["starts"] > before)
     bridge.until("unready", lambda: not bridge.ready())
     bridge.start_anvil()
     bridge.until("ready again", bridge.ready)
 
 
 def test_sighup_reloads_server_toml_and_the_robots_go_on(bridge: Bridge):
+    """With another number of shards, too: from 2 to 4, to 1, and to 2 again."""
     assert bridge.server is not None
     bridge.until("ready at first", bridge.ready)
     robot = bridge.start_robot('kind = "sim"')
     bridge.until("a session", lambda: bridge.figures()["channel connections"] == 1)
     config = bridge.path / "operator" / "server.toml"
-    good, before = config.read_text(), bridge.figures()["starts"]
+    good, before = config.read_text(), bridge.pid("shard-0")
     try:
         config.write_text(good.replace("[chain]", "[chain]\nconfirmations = 0"))
         bridge.server.send_signal(signal.SIGHUP)
         bridge.until("refused", lambda: bridge.said("server.log", "nothing is reloaded") == 1)
-        assert bridge.figures()["starts"] == before
-        config.write_text(good.replace("[chain]", "workers = 3\n[chain]\nconfirmations = 2"))
-        bridge.server.send_signal(signal.SIGHUP)
-        bridge.until("reloaded", lambda: bridge.said("server.log", "reloaded: channel, chain,") == 1)
-        assert bridge.said("server.log", "not before the next start: workers") == 1
-        bridge.until("other processes", lambda: bridge.figures()["starts"] == before + 3)
-        bridge.until("ready", bridge.ready)
-        bridge.until("the session again", lambda: bridge.figures()["channel connections"] == 1)
-        written = bridge.figures().get("chain_chunks robot_1", 0)
-        bridge.until("what follows", lambda: bridge.figures().get("chain_chunks robot_1", 0) > written + 1)
-        assert bridge.figures()["waiting_chunks robot_1"] > 0, "two confirmations: the last block's are not confirmed"
+        assert bridge.pid("shard-0") == before
+        for number, shards in enumerate((4, 1, 2), 1):
+            config.write_text(good.replace("shards = 2", f"shards = {shards}"))
+            bridge.server.send_signal(signal.SIGHUP)
+            bridge.until("reloaded", lambda number=number: bridge.said("server.log", "reloaded: shard-0") == number)
+            bridge.until("ready", bridge.ready)
+            bridge.shards = shards
+            bridge.until("the session again", lambda: bridge.figures()["channel connections"] == 1)
+            written = bridge.figures().get("chain_chunks robot_1", 0)
+            bridge.until("what follows", lambda written=written: (
+                bridge.figures().get("chain_chunks robot_1", 0) > written + 1))
+            assert len(list((bridge.path / "operator").glob(".shard-*.prom"))) == shards
     finally:
+        bridge.shards = 2
         config.write_text(good)
         robot.terminate()
-        bridge.server.send_signal(signal.SIGHUP)
     assert robot.wait(30) == 0
-    bridge.until("as before", lambda: bridge.said("server.log", "reloaded: channel, chain,") == 2)
     bridge.until("confirmed", lambda: bridge.figures()["waiting_chunks robot_1"] == 0)
     verdict = json.loads(bridge.do("read", "robot_1", "--passphrase-file", "readers", "--json").stdout)
     assert verdict["sound"] and verdict["head"]["goodbye"]
@@ -325,7 +336,7 @@ def test_all_homes_come_back_from_backups_and_nothing_is_lost_or_doubled(bridge:
 def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Bridge, number: signal.Signals):
     assert bridge.server is not None
     bridge.until("ready at first", bridge.ready)
-    children = [bridge.pid(name) for name in ("worker-0", "worker-1", "submitter", "monitor")]
+    children = [bridge.pid(name) for name in ("shard-0", "shard-1")]
     bridge.server.send_signal(number)
     assert bridge.server.wait(30) == ExitCode.OK
     assert all({"time", "level", "part", "process", "event"} <= event.keys() for event in bridge.events("server.log"))
@@ -337,7 +348,7 @@ def test_a_server_ends_in_good_order_and_its_log_is_events_to_the_end(bridge: Br
 def test_children_of_a_killed_server_end_by_themselves(bridge: Bridge):
     assert bridge.server is not None
     bridge.until("ready at first", bridge.ready)
-    children = [bridge.pid(name) for name in ("worker-0", "worker-1", "submitter", "monitor")]
+    children = [bridge.pid(name) for name in ("shard-0", "shard-1")]
     bridge.server.kill()
     bridge.server.wait(10)
     bridge.until("gone", lambda: not any(Path(f"/proc/{child}").exists() for child in children))

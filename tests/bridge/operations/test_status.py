@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import time
 from collections.abc import Callable
@@ -35,7 +36,7 @@ from rosbridge_eth.operator.registry import Registry
 from rosbridge_eth.operator.status import span
 from rosbridge_eth.robot.loop import open_robot
 from rosbridge_eth.server import metrics
-from rosbridge_eth.server.supervisor import open_submitter
+from rosbridge_eth.server.shard import open_submitter
 
 TK = robot_id("robot_1")
 STREAM = b"s" * 16
@@ -100,7 +101,7 @@ def test_a_revoked_robot_is_no_alarm_unless_some_of_its_chunks_wait(
 
         def alarms(now: float) -> tuple[list[str], float]:
             submitter.turn(now)
-            metrics.show_submitter(submitter, inbox, registry.robots(), place.operator.path, now)
+            metrics.show_submitter("shard-0", submitter, inbox, registry.robots(), place.operator.path, now)
             return status(capsys)["alarms"], metrics.HELD.labels("robot_1")._value.get()
 
         now = time.time()
@@ -121,8 +122,7 @@ def test_accounts_are_on_lines_of_their_own_at_any_width(place: Place, monkeypat
 
 def test_without_a_store_or_a_contract_it_is_no_trouble(place: Place, capsys: Capture):
     report = status(capsys)
-    assert not (place.operator.path / "store.sqlite").exists()
-    assert not any("store" in line for line in report["unknown"])
+    assert not place.operator.store(0).exists() and not any("store" in line for line in report["unknown"])
     place.operator.deployment_file.unlink()
     report = status(capsys)
     assert report["contract"] is None and any("deploy" in line for line in report["unknown"])
@@ -232,12 +232,9 @@ def test_a_node_that_is_behind_a_registration_is_told_as_such(
 def test_no_address_is_broken_at_80_columns(place: Place, monkeypatch: Patch, capsys: Capture):
     monkeypatch.setenv("COLUMNS", "80")
     source = "[2001:db8:1234:5678:9abc:def0:1234:5678]:54321"
-    with metrics.shared(place.operator.path):
-        for process in ("worker-0", "submitter"):
-            metrics.STARTS.labels(process).set(1)
-            metrics.beat(process, time.time())
-        metrics.SESSION.labels("robot_1", source).set(time.time())
-        assert run(["status"]) == 0
+    metrics.SESSION.labels("robot_1", source).set(time.time())
+    metrics.save(metrics.file_of(place.operator.path, "shard-0"))
+    assert run(["status"]) == 0
     shown = capsys.readouterr().out
     contract = place.operator.deployment().contract
     for address in (source, contract, place.operator.account):
@@ -310,67 +307,83 @@ def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: P
 # Who is connected
 
 
-def test_who_is_connected_and_what_comes_from_them_is_what_the_running_server_shows(place: Place, capsys: Capture):
+def test_who_is_connected_and_what_comes_from_them_is_what_the_running_shards_show(place: Place, capsys: Capture):
     now = time.time()
-    place.configure('name = "server"', 'name = "server"\nworkers = 2')  # since it was started, with one
-    with metrics.shared(place.operator.path):
-        for process in ("submitter", "worker-0", "monitor"):
-            metrics.STARTS.labels(process).set(1)
-        metrics.beat("worker-0", now)
-        metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
-        metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
-        metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
-        metrics.RATE.labels("worker-1", "robot_1").set(12.5)  # it moved from one worker to the other
-        metrics.RATE.labels("worker-0", "robot_1").set(0)
-        metrics.NEWEST.labels("worker-1", "robot_1").set(now - 30)
-        metrics.NEWEST.labels("worker-0", "robot_1").set(now - 300)
-        metrics.GAS.labels("robot_1").set(123_000)
+    files = [metrics.file_of(place.operator.path, f"shard-{shard}") for shard in range(2)]
+    metrics.BEAT.labels("shard-0").set(now)
+    metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
+    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
+    metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
+    metrics.RATE.labels("shard-0", "robot_1").set(12.5)
+    metrics.NEWEST.labels("shard-0", "robot_1").set(now - 30)
+    metrics.GAS.labels("robot_1").set(123_000)
+    metrics.save(files[0])
+    files[1].touch()
+    report = status(capsys)
+    robot = report["robots"]["robot_1"]
+    assert (robot["connected"], robot["address"]) == (True, "192.0.2.2") and "robot_2" not in report["robots"]
+    assert (robot["rate"], robot["gas"]) == (12.5, 123_000) and 30 <= robot["newest"] < 60
+    assert report["process"] == []
+    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
+    metrics.CONDITION.labels("shard-0", "node answers").set(0)
+    metrics.save(files[0])
+    report = status(capsys)
+    assert report["robots"]["robot_1"]["connected"] is False
+    assert report["process"] == ["shard-0: node answers"] and "node answers" in report["alarms"][0]
+    assert run(["status"]) == 0
+    shown = capsys.readouterr().out
+    assert "NOT READY: shard-0: node answers" in shown and "12.5" in shown and "ALARM: " in shown
+
+
+def test_a_shard_or_a_server_that_was_killed_is_not_ready(place: Place, capsys: Capture):
+    files = [metrics.file_of(place.operator.path, f"shard-{shard}") for shard in range(2)]
+    metrics.BEAT.labels("shard-0").set(time.time())
+    metrics.RATE.labels("shard-0", "robot_1").set(12.5)
+    for killed in range(2):
+        for each in files:
+            metrics.save(each)
+        for each in files[1 - killed:]:
+            os.utime(each, (time.time() - 60, time.time() - 60))
         report = status(capsys)
-        robot = report["robots"]["robot_1"]
-        assert (robot["connected"], robot["address"]) == (True, "192.0.2.2") and "robot_2" not in report["robots"]
-        assert (robot["rate"], robot["gas"]) == (12.5, 123_000) and 30 <= robot["newest"] < 60
-        assert report["process"] == ["submitter runs"], "it has not beaten"
-        metrics.beat("submitter", now)
-        metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
-        metrics.CONDITION.labels("node answers").set(0)
-        report = status(capsys)
-        assert report["robots"]["robot_1"]["connected"] is False
-        assert report["process"] == ["node answers"] and "node answers" in report["alarms"][0]
+        dead = [f"{each.stem[1:]} runs" for each in files[1 - killed:]]
+        assert report["process"] == dead and report["alarms"][0] == f"ALARM: the server is not ready: {dead[0]}: no"
+        assert ("rate" in report["robots"]["robot_1"]) is (killed == 0), "what a killed one left is not true any more"
         assert run(["status"]) == 0
-        shown = capsys.readouterr().out
-        assert "NOT READY: node answers" in shown and "12.5" in shown and "ALARM: " in shown
-        metrics.beat("worker-0", now - 60)
-        metrics.beat("submitter", now - 60)
-        report = status(capsys)
-        assert report["process"] is None and "rate" not in report["robots"]["robot_1"], "what was left by a killed one"
-    assert status(capsys)["process"] is None and not (place.operator.path / ".figures").is_symlink()
+        assert f"NOT READY: {', '.join(dead)}" in capsys.readouterr().out
+    for file in files:
+        file.unlink()
+    assert status(capsys)["process"] is None, "it was ended in good order"
 
 
 def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Place):
     from rich.console import Console
 
     screen = Console(width=100, record=True, file=io.StringIO())
-    with metrics.shared(place.operator.path):
-        for process in ("worker-0", "submitter"):
-            metrics.STARTS.labels(process).set(1)
-            metrics.beat(process, time.time())
-        metrics.SESSION.labels("robot_1", "192.0.2.2").set(time.time())
-        metrics.WAITING.labels("robot_1").set(7)
-        metrics.OLDEST.labels("robot_1").set(300)
-        metrics.ON_CHAIN.labels("robot_1").set(41)
-        metrics.BLOCK.labels("robot_1").set(99)
-        metrics.HELD.labels("robot_1").set(1)
-        screen.print(module.fleet(place.operator))
+    metrics.BEAT.labels("shard-0").set(time.time())
+    metrics.SESSION.labels("robot_1", "192.0.2.2").set(time.time())
+    metrics.WAITING.labels("robot_1").set(7)
+    metrics.OLDEST.labels("robot_1").set(300)
+    metrics.ON_CHAIN.labels("robot_1").set(41)
+    metrics.BLOCK.labels("robot_1").set(99)
+    metrics.HELD.labels("robot_1").set(1)
+    metrics.save(metrics.file_of(place.operator.path, "shard-0"))
+    screen.print(module.fleet(place.operator))
     shown = screen.export_text()
     assert re.search(r"robot_1 .* 192\.0\.2\.2 .* 7 \(5m\) .* 41 +99 ", shown), shown
     assert "robot_1 is on hold" in shown and "has waited 5m" in shown
 
 
-def test_how_fast_a_count_grows_is_what_it_grew_by_in_the_last_ten_looks():
-    rates = metrics.Rates()
-    assert rates.of("a", 100, 0.0) == 0.0
-    assert [rates.of("a", 100 + 5 * second, second) for second in range(1, 30)] == [5.0] * 29
-    assert rates.of("a", 245, 30) == 4.5 and rates.of("b", 7, 30) == 0.0
+def test_what_a_robot_left_in_the_store_of_another_shard_is_not_counted(place: Place, capsys: Capture):
+    tk = int.from_bytes(TK, "big")
+    place.configure('"127.0.0.1:0"', '"127.0.0.1:7410"')
+    inbox = place.inbox()
+    inbox.append([Offer(TK, chunk) for chunk in chunk_chain(3)], time.time())
+    inbox.close()
+    assert status(capsys)["robots"]["robot_1"]["waiting"]["chunks"] == 3
+    shards = next(number for number in range(2, 64) if tk % number)
+    place.configure('name = "server"', f'name = "server"\nshards = {shards}')
+    report = status(capsys)
+    assert "waiting" not in report["robots"]["robot_1"] and report["unknown"] == status(capsys)["unknown"]
 
 
 # A robot's home
@@ -400,16 +413,16 @@ def test_a_robots_home_shows_its_spool_and_whether_it_runs(place: Place, capsys:
 
 def test_a_running_robot_shows_its_figures(place: Place, capsys: Capture):
     place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
-    with metrics.shared(place.robot.path):
-        robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
-        try:
-            metrics.show_robot("robot_1", robot, time.time())
-            report = status(capsys, "--home", "robot")
-            assert "robot has a session" in report["process"]
-            assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
-        finally:
-            robot.spool.close()
-            robot.loop.close()
+    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+    try:
+        metrics.show_robot("robot_1", robot, time.time())
+        metrics.save(metrics.file_of(place.robot.path, "robot"))
+        report = status(capsys, "--home", "robot")
+        assert "robot: robot has a session" in report["process"]
+        assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
+    finally:
+        robot.spool.close()
+        robot.loop.close()
 
 
 def test_a_robot_without_its_bundle_is_told_what_is_next(place: Place, capsys: Capture):
@@ -472,7 +485,7 @@ def test_of_one_robot_it_is_said_how_far_its_log_is_written_and_confirmed(
     assert run(["status", "robot_1"]) == 0
     said = capsys.readouterr().out
     assert f"robot_1: confirmed up to chunk 1 of stream {STREAM.hex()}, in block {block - 1}" in said
-    for file in place.path.glob("operator/store.sqlite*"):
+    for file in place.path.glob("operator/store-0.sqlite*"):
         file.unlink()
     assert log()["written"] == second, "the chain alone is enough"
 

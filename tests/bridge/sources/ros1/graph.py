@@ -154,9 +154,10 @@ class Listening:
         )
         return self.data.get(topic, [])
 
-    def ended(self, topic: str) -> int:
-        """Attempts to connect, and connections, that came to nothing."""
-        return self.source.counts[topic, "ended"]
+    def connected(self, topic: str) -> int:
+        """Publishers of the topic that are being read."""
+        known = self.source._topics.get(topic)
+        return sum(each.publication is not None for each in known.publishers.copy().values()) if known else 0
 
     def numbers(self, topic: str) -> list[int]:
         return [data["data"] for data in self.data.get(topic, ())]

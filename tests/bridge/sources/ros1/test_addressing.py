@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 
 import pytest
@@ -11,14 +10,13 @@ from hypothesis import strategies as st
 
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
-from rosbridge_eth.robot.sources.ros1.addressing import (
+from rosbridge_eth.robot.sources.ros1.api import (
     ProtocolError,
     bind_host,
-    is_graph_name,
     master_address,
     node_name,
+    offers,
     own_host,
-    read_address,
     read_uri,
 )
 
@@ -107,13 +105,7 @@ def test_any_text_is_an_endpoint_or_refused(text):
     assert 0 < endpoint.port < 65536
 
 
-@given(st.one_of(st.none(), st.integers(), st.text(), st.booleans()), st.one_of(st.none(), st.integers(), st.text()))
-def test_any_values_are_an_endpoint_or_refused(host, port):
-    with contextlib.suppress(ProtocolError):
-        assert read_address(host, port) == (host, port)
-
-
 def test_names():
     assert node_name("/a/b") == node_name("a/b") == "/a/b"
-    assert is_graph_name(node_name(None))
-    assert not any(map(is_graph_name, ["", "/", "a", "/a b", "/a\n", "/" + "a" * 300, "/ä", None, 3]))
+    names = ["", "/", "a", "/a b", "/a\n", "/" + "a" * 300, "/ä", own := node_name(None)]
+    assert [offer.topic for offer in offers({name: ["/n"] for name in names}, {})] == [own]

@@ -179,7 +179,8 @@ def test_a_topic_may_appear_late_and_the_domain_may_be_configured(ros: Graph):
     watcher = ros.watcher(
         f'topics = ["/late/*", "/never"]\n[source]\nkind = "ros2"\ndomain = {ros.domain}', ROS_DOMAIN_ID=elsewhere
     )
-    watcher.says("nothing publishes /late/*, /never yet")
+    for name in ("/late/*", "/never"):
+        watcher.says(f"nothing publishes {name} yet")
     node = ros.node("/base")
     for topic in ("/late/a", "/late/b", "/other"):
         node.order(create=topic, type=NUMBER)

@@ -14,6 +14,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 from rosbridge_eth.capture import (
@@ -27,12 +28,15 @@ from rosbridge_eth.capture import (
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources import Selection, open_source
+from rosbridge_eth.robot.sources.ros2 import source as ros2
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(message)s")
-stop = threading.Event()
+stop, taken = threading.Event(), Counter[str]()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
 before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 config = load_robot_config(Path(sys.argv[1]))
+if "hold" in sys.argv:
+    ros2.QUEUE = 2 << 20  # type: ignore[misc]
 
 
 def say(value: dict[str, object]) -> None:
@@ -51,6 +55,7 @@ def rebuilt(record: Record) -> bool:
 def emit(raw: RawMessage) -> None:
     if "hold" in sys.argv:
         sys.stdin.read()
+    taken[raw.topic] += 1
     captured = capture.process(raw, time.time_ns())
     if captured is not None:
         say({"record": json.loads(captured.line), "rebuilt": rebuilt(captured)})
@@ -72,8 +77,8 @@ except SourceError as error:
 for line in capture.loss_lines(source.lost):
     say({"declared": json.loads(line)})
 statistics: dict[str, dict[str, int]] = {}
-for topic in dict.fromkeys(topic for topic, _ in source.counts):
-    counts = {what: source.counts[topic, what] for what in ("received", "lost", "foreign")}
-    statistics[topic] = counts | {"dropped": source.lost.get((topic, "dropped"), 0)}
+for topic in {*taken, *(topic for topic, _ in source.lost)}:
+    lost = {what: source.lost.get((topic, what), 0) for what in ("lost", "foreign", "dropped")}
+    statistics[topic] = {"received": taken[topic] + lost["dropped"], **lost}
 say({"statistics": statistics})
 say({"threads": [thread.name for thread in threading.enumerate()]})

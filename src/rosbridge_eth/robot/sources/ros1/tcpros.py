@@ -9,27 +9,21 @@ microcontrollers' bridges do), that of ROS Noetic serves if it has the same md5 
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Mapping
 from typing import BinaryIO, Final, NamedTuple
 
 from rosbridge_eth.capture import Decoder, DefinitionError, Wire, decoder_for, decoder_for_known, normalised_type_name
-from rosbridge_eth.robot.sources.ros1.addressing import ProtocolError
-from rosbridge_eth.robot.sources.ros1.api import Refusal
+from rosbridge_eth.robot.sources.ros1.api import ProtocolError, Refusal
 
 MAX_HEADER: Final = 1 << 20
 """Bytes of a connection header: four times the longest message definition that is read."""
-MAX_FIELDS: Final = 64
-"""Fields of a connection header; publishers send seven or eight."""
 IMPLAUSIBLE: Final = 1_000_000_000
 """A message length above this means that the stream is out of step; roscpp draws the line at the same place."""
 ANY: Final = "*"
 """As a subscriber's type and md5 sum: whatever you publish."""
 
 _LENGTH = struct.Struct("<I")
-_NAME = re.compile(rb"[A-Za-z0-9_]{1,64}")
-_MD5 = re.compile(r"[0-9a-f]{32}")
 _PIECE: Final = 1 << 16
 
 
@@ -49,39 +43,25 @@ def request_header(topic: str, node: str) -> bytes:
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
     """A connection header with its length before it."""
-    body = b"".join(
-        _LENGTH.pack(len(field)) + field for field in (f"{name}={value}".encode() for name, value in fields.items())
-    )
+    encoded = (f"{name}={value}".encode() for name, value in fields.items())
+    body = b"".join(_LENGTH.pack(len(field)) + field for field in encoded)
     return _LENGTH.pack(len(body)) + body
 
 
 def read_header(stream: BinaryIO) -> dict[str, str]:
     """The fields of the publisher's header. Raises ProtocolError, or EOFError."""
-    length = read_length(stream)
-    if length > MAX_HEADER:
-        raise ProtocolError(f"a connection header of {length} bytes is not read; at most {MAX_HEADER}")
-    return decode_header(read_exactly(stream, length))
-
-
-def decode_header(body: bytes) -> dict[str, str]:
-    """The fields of a connection header, without the length before it. Raises ProtocolError."""
-    fields: dict[str, str] = {}
-    position = 0
-    while position < len(body):
-        if position + 4 > len(body):
-            raise ProtocolError("the connection header ends within a field's length")
-        (length,) = _LENGTH.unpack_from(body, position)
-        position += 4
-        if length > len(body) - position:
+    left, fields = read_length(stream), dict[str, str]()
+    if left > MAX_HEADER:
+        raise ProtocolError(f"a connection header of {left} bytes is not read; at most {MAX_HEADER}")
+    while left:
+        length = read_length(stream)
+        left -= 4 + length
+        if left < 0:
             raise ProtocolError(f"a field of {length} bytes does not fit into the connection header")
-        name, equals, value = body[position : position + length].partition(b"=")
-        position += length
-        if not equals or not _NAME.fullmatch(name):
+        name, equals, value = read_exactly(stream, length).decode("utf-8", "replace").partition("=")
+        if not equals:
             raise ProtocolError("a field of the connection header is not name=value")
-        if len(fields) == MAX_FIELDS:
-            raise ProtocolError(f"the connection header has more than {MAX_FIELDS} fields")
-        if fields.setdefault(name.decode(), text := value.decode("utf-8", "replace")) != text:
-            raise ProtocolError(f"the connection header has {name.decode()} twice")
+        fields[name] = value
     return fields
 
 
@@ -111,27 +91,16 @@ def read_publication(topic: str, fields: Mapping[str, str]) -> Publication:
     """Judge the answer to our header. Raises Refusal, ProtocolError or DefinitionError."""
     if "error" in fields:
         raise Refusal(f"the publisher refuses: {fields['error'][:200]}")
-    for name in ("type", "md5sum"):
-        if name not in fields:
-            raise ProtocolError(f"the publisher's header has no {name}")
+    if missing := {"type", "md5sum"} - fields.keys():
+        raise ProtocolError(f"the publisher's header has no {min(missing)}")
     if fields.get("topic", topic) != topic:
         raise ProtocolError(f"the publisher's header is for another topic, {fields['topic'][:60]!r}")
     if fields["type"] == ANY:
         raise Refusal("the publisher does not say which type it sends")
-    md5 = fields["md5sum"].lower()
-    if not _MD5.fullmatch(md5):
-        raise ProtocolError(f"{fields['md5sum'][:60]!r} is not an md5 sum")
-    name = normalised_type_name(fields["type"])
-    decoder = _decoder(name, md5, fields.get("message_definition", ""))
+    name, md5, text = normalised_type_name(fields["type"]), fields["md5sum"].lower(), fields.get("message_definition")
+    decoder = decoder_for(Wire.ROS1, name, text) if text and text.strip() else decoder_for_known(Wire.ROS1, name)
+    if decoder is None:
+        raise DefinitionError(f"the publisher does not define {name}, and ROS Noetic does not ship it")
+    if decoder.definition.md5 != md5:
+        raise DefinitionError(f"the definition of {name} has the md5 sum {decoder.definition.md5}, not {md5[:60]!r}")
     return Publication(name, md5, decoder, fields.get("callerid", "")[:256])
-
-
-def _decoder(name: str, md5: str, text: str) -> Decoder:
-    if not text.strip() and (known := decoder_for_known(Wire.ROS1, name)) and known.definition.md5 == md5:
-        return known
-    if not text.strip():
-        raise DefinitionError(f"the publisher does not define {name}, and it is not the one that Noetic ships")
-    decoder = decoder_for(Wire.ROS1, name, text)
-    if (computed := decoder.definition.md5) != md5:
-        raise DefinitionError(f"the definition of {name} has the md5 sum {computed}, not {md5} as announced")
-    return decoder

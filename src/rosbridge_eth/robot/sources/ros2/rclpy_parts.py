@@ -5,10 +5,7 @@ some file found beside it, says what the bytes are. It has that description in e
 `get_fields_and_field_types()`, types in `SLOT_TYPES` (rosidl_parser.definition). Written out as MSG with its parts (as
 in an mcap file), it passes the same checks as a definition that came over the network.
 
-Which quality of service a subscription asks for (DDS 1.4, 2.2.3): it gets nothing from a publisher that offers less
-than it asks for (best effort < reliable, volatile < transient local). Asking for less than is offered loses what could
-have been had: retransmission, the last latched message. So it asks for the most that all publishers offer, and if what
-they offer changes, the subscription changes too.
+Needs ROS 2 Iron or later (BEST_AVAILABLE).
 """
 
 from __future__ import annotations
@@ -38,15 +35,11 @@ _BASES: Final = {"boolean": "bool", "octet": "byte", "float": "float32", "double
 def import_rclpy() -> Any:
     """A namespace of rclpy's classes; its modules have no types here. Raises SourceError."""
     try:
-        qos = import_module("rclpy.qos")
-        try:
-            events = import_module("rclpy.event_handler")
-        except ModuleNotFoundError:  # before Iron
-            events = import_module("rclpy.qos_event")
         return SimpleNamespace(
-            Context=import_module("rclpy.context").Context, Node=import_module("rclpy.node").Node, qos=qos,
+            Context=import_module("rclpy.context").Context, Node=import_module("rclpy.node").Node,
             SingleThreadedExecutor=import_module("rclpy.executors").SingleThreadedExecutor,
-            SubscriptionEventCallbacks=events.SubscriptionEventCallbacks,
+            SubscriptionEventCallbacks=import_module("rclpy.event_handler").SubscriptionEventCallbacks,
+            qos=import_module("rclpy.qos"),
         )  # fmt: skip
     except ImportError as error:
         raise SourceError(f"a ROS 2 source needs rclpy ({first_line(error)}); {GET_RCLPY}") from error

@@ -1,0 +1,246 @@
+"""The parent of the shards: what it checks, when it starts one again, how children end; and a shard's two halves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import rosbridge_eth
+from bridge.operations.conftest import Place
+from rosbridge_eth.channel.udp import server_socket
+from rosbridge_eth.cli import run
+from rosbridge_eth.config import Address
+from rosbridge_eth.config.home import shard_of
+from rosbridge_eth.errors import ConfigError, ExitCode, NetworkError, StoreError
+from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.robot.spool import Spool
+from rosbridge_eth.server import metrics, parent
+from rosbridge_eth.server.parent import FIRST_PAUSE, LONG_LIFE, LONGEST_PAUSE, Child, Parent, notify
+from rosbridge_eth.server.shard import Shard, submit
+
+SECRETS: Any = None
+
+
+def lives(*lengths: float) -> list[float]:
+    """The pauses after lives of these lengths."""
+    child, pauses = Child(), []
+    for length in lengths:
+        child.since = 1000.0
+        child.ended(1000.0 + length)
+        assert child.due == 1000.0 + length + child.pause
+        pauses.append(child.pause)
+    return pauses
+
+
+def test_pauses_grow_up_to_half_a_minute_and_never_end():
+    pauses = lives(*[0.1] * 20)
+    assert pauses[:3] == [FIRST_PAUSE, 2 * FIRST_PAUSE, 4 * FIRST_PAUSE]
+    assert pauses == sorted(pauses) and pauses[-1] == LONGEST_PAUSE
+
+
+def test_a_shard_that_worked_for_a_while_begins_anew():
+    assert lives(0.1, 0.1, 0.1, LONG_LIFE + 1, 0.1)[-2:] == [FIRST_PAUSE, 2 * FIRST_PAUSE]
+
+
+def test_what_is_due_is_started_and_what_ended_is_due_after_its_pause(place: Place, monkeypatch: pytest.MonkeyPatch):
+    started: list[int] = []
+
+    class Process:
+        pid, exitcode, name = 1, -9, "shard"
+
+        def __init__(self, target: object, args: tuple[Any, ...], name: str) -> None:
+            self.alive, self.shard = True, args[2]
+
+        def start(self) -> None:
+            started.append(self.shard)
+
+        def is_alive(self) -> bool:
+            return self.alive
+
+    monkeypatch.setattr(parent, "_FORK", SimpleNamespace(Process=Process))
+    running, config = Parent(place.operator, SECRETS), SimpleNamespace(shards=2)
+    running._children = {0: Child(), 1: Child()}
+    running._look(config, 100.0)  # type: ignore[arg-type]
+    assert started == [0, 1]
+    running._children[1].process.alive = False  # type: ignore[union-attr]
+    for moment, expected in ((100.2, [0, 1]), (101.0, [0, 1]), (101.3, [0, 1, 1]), (101.5, [0, 1, 1])):
+        running._look(config, moment)  # type: ignore[arg-type]
+        assert started == expected, moment
+    assert [child.starts for child in running._children.values()] == [1, 2]
+
+
+def test_who_starts_a_second_one_by_mistake_leaves_the_first_its_figures(
+    place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(parent.Ledger, "check", lambda ledger: None)
+    metrics.BEAT.labels("shard-0").set(1.0)
+    metrics.save(metrics.file_of(place.operator.path, "shard-0"))
+    with closing(server_socket(Address("127.0.0.1", 0))) as door:
+        place.configure('listen = "127.0.0.1:0"', f'listen = "127.0.0.1:{door.getsockname()[1]}"')
+        with pytest.raises(NetworkError, match="in use"):
+            Parent(place.operator, SECRETS).run()
+    assert metrics.running(place.operator.path)["shard-0"] == [("beat_seconds", {"process": "shard-0"}, 1.0)]
+    place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
+    metrics.save(metrics.file_of(place.robot.path, "robot"))
+    log = Log(place.robot.bridge().ledger, robot_id("robot_1"))
+    with closing(Spool(place.robot.spool, log, max_bytes=2**20, drop=lambda chunk: chunk)):
+        assert run(["robot", "--password-file", "word"]) == ExitCode.STORE
+        assert "in use" in capsys.readouterr().err
+    assert metrics.running(place.robot.path)["robot"]
+
+
+@pytest.mark.parametrize("text, only, says", [
+    ("", [1], "there is no shard 1: .*shards = 1"),
+    ('shards = 4\npublic = "0.0.0.0:7410"', [], "no machine's address"),
+])  # fmt: skip
+def test_shards_that_robots_could_not_find_are_not_started(place: Place, text: str, only: list[int], says: str):
+    config = place.operator.config.read_text().replace('public = "127.0.0.1:9"', text)
+    place.operator.config.write_text(config.replace('"127.0.0.1:0"', '"127.0.0.1:7410"'))
+    with pytest.raises(ConfigError, match=says):
+        Parent(place.operator, SECRETS, only).run()
+
+
+def test_figures_of_shards_that_are_no_more_are_removed(place: Place, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Parent, "_look", lambda *_: None)
+    for shard in range(4):
+        metrics.save(metrics.file_of(place.operator.path, f"shard-{shard}"))
+    Parent(place.operator, SECRETS)._begin(SimpleNamespace(shards=2))  # type: ignore[arg-type]
+    assert list(metrics.running(place.operator.path)) == ["shard-0", "shard-1"]
+
+
+def test_every_robot_has_one_shard_and_they_are_even():
+    robots = [robot_id(f"robot_{number}") for number in range(4000)]
+    for shards in (1, 2, 4, 64):
+        counts = [sum(shard_of(tk, shards) == shard for tk in robots) for shard in range(shards)]
+        assert sum(counts) == 4000 and max(counts) < 4000 / shards * 1.5
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_the_service_manager_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bool):
+    name = f"@rosbridge-eth-{os.getpid()}" if abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind("\0" + name[1:] if abstract else name)
+        manager.settimeout(5)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        notify("READY=1")
+        assert manager.recv(100) == b"READY=1"
+    notify("WATCHDOG=1")  # the manager is gone
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    notify("STOPPING=1")
+
+
+# A shard
+
+
+class Clock(threading.Event):
+    """The submitter's `stop`, which waits by a clock of its own, and is set after 50 seconds of it."""
+
+    now = 100.0
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.now += timeout or 0.0
+        if self.now >= 150:
+            self.set()
+        return self.is_set()
+
+
+def test_the_submitter_asks_as_seldom_as_it_says_and_is_seen_meanwhile():
+    stop, turns, seen = Clock(), list[float](), list[float]()
+
+    def turn(now: float) -> float:
+        turns.append(stop.now)
+        if stop.now == 110:
+            raise StoreError("away")
+        return 10.0 if stop.now < 120 else 30.0
+
+    submitter: Any = SimpleNamespace(turn=turn, trouble=None, unconfirmed=None, funds=None)
+    submit(submitter, stop, lambda: seen.append(stop.now), lambda: stop.now)
+    assert turns == [100, 110, 111, 121]
+    assert seen == [float(second) for second in range(100, 150) if second != 110]
+
+
+class Half:
+    """A reception that runs until it is told to stop, or a submitter whose turn fails."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.error, self.trouble, self.unconfirmed, self.funds = error, None, None, None
+        self.loop = SimpleNamespace(wake=lambda: None)
+        self.turns = 0
+
+    def run(self, stopped: Any, on_turn: Any) -> None:
+        while not stopped():
+            if self.error is not None:
+                raise self.error
+            on_turn()
+            time.sleep(0.01)
+
+    def turn(self, now: float) -> float:
+        self.turns += 1
+        if self.error is not None:
+            raise self.error
+        return 0.01
+
+
+@pytest.mark.parametrize("reception, submitter", [(None, RuntimeError("a defect")), (StoreError("exchanged"), None)])
+def test_what_ends_one_half_of_a_shard_ends_the_other(reception: Exception | None, submitter: Exception | None):
+    shard: Any = Shard(Half(reception), Half(submitter))  # type: ignore[arg-type]
+    with pytest.raises((RuntimeError, StoreError), match=r"defect|exchanged"):
+        shard.run(lambda: False)
+
+
+def test_a_shard_that_is_stopped_ends():
+    shard: Any = Shard(Half(), Half())  # type: ignore[arg-type]
+    shard.run(lambda: shard.submitter.turns > 3)
+
+
+CHILD = """
+import os, signal, sys, time
+from types import SimpleNamespace
+from rosbridge_eth.errors import StoreError
+from rosbridge_eth.server import parent
+signal.signal(signal.SIGTERM, lambda number, frame: print("the parent's own", flush=True))
+
+def good(shard, config, home, secrets, stopped):
+    os.write(1, b"forked\\n")  # at once, whole
+    while not stopped():
+        time.sleep(0.02)
+
+def bad(*given):
+    os.write(1, b"forked\\n")
+    time.sleep(0.5)
+    raise StoreError("exchanged")
+
+parent.run_shard = {"good": good, "bad": bad}[sys.argv[1]]
+process = parent._FORK.Process(target=parent._child, args=(os.getpid(), 1, 0, None, None, None))
+process.start()
+os.write(1, b"%d\\n" % process.pid)
+process.join(30)
+print("code", process.exitcode, flush=True)
+"""
+
+
+@pytest.mark.parametrize("task, ends", [("good", "code 0"), ("bad", "code 5")])
+def test_a_child_ends_when_it_is_asked_to_and_says_by_its_code_why_it_ended_else(task: str, ends: str):
+    source = str(Path(rosbridge_eth.__file__).parents[1])
+    process = subprocess.Popen([sys.executable, "-c", CHILD, task], stdout=subprocess.PIPE, text=True,
+                               env={**os.environ, "PYTHONPATH": source})  # fmt: skip
+    assert process.stdout is not None
+    said = [process.stdout.readline().strip() for _ in range(2)]
+    pid = int(next(line for line in said if line.isdigit()))
+    for ignored in (signal.SIGHUP, signal.SIGINT):
+        os.kill(pid, ignored)
+    time.sleep(0.1)
+    os.kill(pid, signal.SIGTERM)
+    out, _ = process.communicate(timeout=40)
+    assert ends in out and "the parent's own" not in out
