@@ -150,10 +150,10 @@ class World:
         return self.store.append((pen or self.pen).offers(chunks, self.state(pen).digest), self.now)
 
     def talk(self, pen: Pen | None = None) -> list[Outcome]:
-        """The robot is told the state, and sends what follows; not before the chain was asked."""
+        """The robot is told the state, and sends what follows."""
         pen = pen or self.pen
         [state] = self.store.states([pen.tk])
-        return self.store.append(pen.told(state), self.now) if pen.tk in self.submitter.asked else []
+        return self.store.append(pen.told(state), self.now)
 
     def turn(self, seconds: float = 1.0, *, mine: int = 0) -> float:
         self.now += seconds
