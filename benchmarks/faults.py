@@ -51,6 +51,7 @@ from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Trust, load_identity
 from rosbridge_eth.ledger import Ledger
 from rosbridge_eth.log.chunk import Chunk, Header, robot_id
+from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.reading import Kind, ProvenRecord, Verdict, read_robot
 from rosbridge_eth.robot.sources import BagSource, Selection
 from rosbridge_eth.robot.sources.bag import sample_bag
@@ -480,10 +481,8 @@ class Flow:
                 if not part.name.endswith("-shm"):
                     shutil.copy(part, copy)
             with closing(sqlite3.connect(Path(copy) / spool.name)) as found:
-                [(last,)] = found.execute("SELECT last FROM spool")
+                self._last += [digest for (digest,) in found.execute("SELECT digest FROM robot") if any(digest)]
                 chunks = [Chunk.parse(data) for (data,) in found.execute("SELECT chunk FROM chunk")]
-        if any(last):
-            self._last.append(last)
         self._left = {chunk.header.digest: chunk.header for chunk in chunks}
         self.count.sessions += program.said.count(" connected to ")
 
@@ -769,7 +768,7 @@ def revoked(site: Site, seed: int) -> Count:
 
 
 def twins(site: Site, seed: int) -> Count:
-    """Two robots with one identity: all that both say is kept, and the reader is told that the log is forked."""
+    """Two robots with one identity: one goes on, the other keeps what it says, and both and the server are told."""
     flow = Flow(site, "one identity twice", seed)
     first = flow.start()
     flow.pause(0.1, 0.3)
@@ -779,8 +778,12 @@ def twins(site: Site, seed: int) -> Count:
     settings.write_text(settings.read_text().replace(f":{flow.monitor}", f":{free_port()}"))
     second = flow.start(double)
     flow.event("a second robot with the same keys")
-    flow.finish(first)
     flow.finish(second, double)
+    until("the first robot is told", lambda: FORKED in first.said)
+    log = site.folder / "server.log"
+    until("the server tells it", lambda: FORKED in log.read_text(errors="replace"))
+    assert first.terminate() == 0
+    flow.buried(first)
     count = flow.audit(allow=frozenset({Kind.FORKED, Kind.MISSING}))
     told = {found.kind for found in site.read(flow.name).verdict.findings}
     if not told & {Kind.RESTARTED, Kind.FORKED, Kind.MISSING}:

@@ -28,7 +28,7 @@ from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk, Log, content_key, drop, open_lines, robot_id, seal
 from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.log.sqlite import SqliteStore
-from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, place_of
+from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, Store, place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.sender import TWICE, Sender
 from rosbridge_eth.robot.spool import Spool
@@ -144,8 +144,11 @@ class World:
         self.machines.append(Machine(self, self.folder / name, ("192.0.2.3", 5000)))
         return self.machines[-1]
 
+    def open_store(self) -> Store:
+        return SqliteStore(self.folder / "store.sqlite", LEDGER, self.room, self.room)
+
     def open_server(self) -> None:
-        self.store = SqliteStore(self.folder / "store.sqlite", LEDGER, self.room, self.room)
+        self.store = self.open_store()
         self.server = Server(ServerConfig(), identity(ids.Role.SERVER), ids.Trust((authority().certificate,)),
                              cookie_key(identity(ids.Role.SERVER)), self.network.now, wall=wall, stopwatch=lambda: 0.0)
         self.reception = Reception(
