@@ -15,7 +15,7 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
-from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
+from rosbridge_eth.channel import Client, ClientConfig, Connected, State
 from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
@@ -170,11 +170,11 @@ def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(
     robot, sent = make(10), list[bytes]()
     sender, spool = robot.sender, robot.spool
     with closing(spool), closing(robot.loop):
-        monkeypatch.setattr(robot.client, "writable", lambda size=0: True)
+        monkeypatch.setattr(robot.client, "room", lambda: 1 << 16)
         monkeypatch.setattr(robot.client, "send", sent.append)
         [chunk] = robot.writer.finish(0)
         spool.append(chunk)
-        robot.handle(Message(b"", ServerState().encode(), robot.client))  # type: ignore[arg-type]
+        robot.handle(State(ServerState().encode()))
         robot._send(0.0)
         assert [decode_offer(offer) for offer in sent] == [(chunk.encoded, b"")]
         here = place_of(chunk.header)
@@ -185,7 +185,7 @@ def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(
             raise full
 
         monkeypatch.setattr(spool, "confirmed", fails)
-        robot.handle(Message(b"", said, robot.client))  # type: ignore[arg-type]
+        robot.handle(State(said))
         robot._send(1.0)
         assert robot.spool_trouble.why == str(full) and len(spool.rows(NOWHERE, 9)) == 1
         monkeypatch.setattr(spool, "confirmed", confirmed)
@@ -291,7 +291,7 @@ def test_a_server_that_says_what_is_no_message_does_not_keep_a_robot_from_captur
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = make(100)
-    noise = Message(b"", b"\xff", robot.client)  # type: ignore[arg-type]
+    noise = State(b"\xff")
     monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(noise))
     robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
     assert f"{robot.chunks} chunks not yet at the server: the server says what is no message" in robot.summary
