@@ -325,9 +325,13 @@ class Server:
             self._due.append((session.due, session))
 
     def _stand(self, session: _Session) -> None:
-        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced."""
-        if (older := self._by_name.get(session.peer.name)) is not None:
-            self._remove(older, End.REPLACED)
+        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced, and
+        none that was begun later: somebody may have held that packet back."""
+        if (other := self._by_name.get(session.peer.name)) is not None:
+            if other.began > session.began:
+                self._remove(session, End.REPLACED)
+                raise Refused(Drop.UNEXPECTED)
+            self._remove(other, End.REPLACED)
         self._by_name[session.peer.name] = session
         self._counts["handshakes"] += 1
         self._events.append(events.Connected(session.peer, session.cid))
