@@ -325,8 +325,8 @@ class Server:
             self._due.append((session.due, session))
 
     def _stand(self, session: _Session) -> None:
-        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced, and
-        none that was begun later: somebody may have held that packet back."""
+        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced;
+        not one that was begun later, since that packet may have been held back."""
         if (other := self._by_name.get(session.peer.name)) is not None:
             if other.began > session.began:
                 self._remove(session, End.REPLACED)
