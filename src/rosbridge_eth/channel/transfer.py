@@ -199,7 +199,6 @@ class Sending:
             if self._unanswered == OUTAGE:
                 self._window.collapse()
             for index in islice(cycle(self._segments), PROBES):
-                self._carrier[index] = -1  # so that it does not go once more when its last packet counts as lost
                 heappush(self._again, index)
 
 
