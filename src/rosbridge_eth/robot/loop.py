@@ -44,7 +44,7 @@ _T = TypeVar("_T")
 
 RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread and the loop, and their bytes
 TAKE = 128  # raw messages captured before the network gets its turn again
-GATHER = 0.04  # seconds that messages gather in the ring: a turn of the loop costs as much as some of them
+GATHER = 0.05  # seconds that messages gather in the ring: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
