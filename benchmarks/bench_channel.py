@@ -1,10 +1,10 @@
 """What chunks, a handshake and a stranger cost at each end of the channel, and how fast it carries.
 
-Run: PYTHONPATH=src python benchmarks/bench_channel.py [--link]
+Run: PYTHONPATH=src python benchmarks/bench_channel.py [--link [SEEDS]] [--beside COMMIT]
 
 Without sockets: bytes in, bytes out, the processor's time of the two ends apart. Through loopback: two processes and
-their sockets. Beside the cipher stands AES-GCM of OpenSSL, by `cryptography`, in the same run. --link adds the rates
-through simulated links with loss (minutes).
+their sockets. Beside the cipher stands AES-GCM of OpenSSL, by `cryptography`, in the same run. --link adds what
+simulated links with loss allow (channel_links.py); --beside the same at another commit, in the same run.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import argparse
 import os
 import platform
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -21,7 +23,7 @@ from functools import partial
 from pathlib import Path
 
 from rosbridge_eth import identity as ids
-from rosbridge_eth.channel import Client, ClientConfig, Connected, Message, Mode, Server, ServerConfig, cookie_key
+from rosbridge_eth.channel import Client, ClientConfig, Message, Mode, Server, ServerConfig, State, cookie_key
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
 from rosbridge_eth.channel.wire import HELLO_PADDING, SEGMENT_SIZE, Hello, Kind
 from smcrypto import sm3, sm4
@@ -37,7 +39,7 @@ clock = time.process_time
 
 
 def make_server(now: float = 0.0, mode: Mode = Mode.EXCHANGE) -> Server:
-    config = ServerConfig(modes=(mode,), source_rate=1e9, source_burst=1e9, handshake_share=1e9)
+    config = ServerConfig(modes=(mode,), handshake_share=1e9)
     return Server(config, HUB, TRUST, cookie_key(HUB), now)
 
 
@@ -64,23 +66,23 @@ def handshake(server: Server, client: Client, now: float) -> tuple[float, float]
         spent[1] += clock() - began
     while client.next_event() or server.next_event():
         pass
-    if client.state != "connected":
+    if not client.connected:
         raise RuntimeError(f"not connected: {server.statistics()}")
     return spent[0], spent[1]
 
 
 def carried(size: int, count: int) -> tuple[float, float]:
-    """Microseconds per message at the robot and at the server, answered by 41 bytes each (a Stored)."""
+    """Microseconds per message at the robot and at the server, answered by a state of 121 bytes (log/hop.py)."""
     server, client = make_server(), make_client()
     handshake(server, client, 0.0)
-    payload, answer = os.urandom(size), bytes(41)
+    payload, rest = os.urandom(size), bytes(117)
     robot = hub = now = 0.0
     sent = got = answered = 0
     while answered < count:
         now += 0.005
         began = clock()
         client.handle_timer(now)
-        while sent < count and client.writable(size):
+        while sent < count and client.room() >= size:
             client.send(payload)
             sent += 1
         up = client.datagrams_to_send(now)
@@ -92,14 +94,14 @@ def carried(size: int, count: int) -> tuple[float, float]:
         while (event := server.next_event()) is not None:
             if isinstance(event, Message):
                 got += 1
-                server.send(event.connection, answer)
+                server.set_state(event.connection, got.to_bytes(4, "big") + rest)
         down = server.datagrams_to_send(now)
         hub += clock() - began
         began = clock()
         for data, _ in down:
             client.receive_datagram(data, THERE, now)
         while (event := client.next_event()) is not None:
-            answered += isinstance(event, Message)
+            answered = int.from_bytes(event.data[:4], "big") if isinstance(event, State) else answered
         robot += clock() - began
     return robot / count * 1e6, hub / count * 1e6
 
@@ -112,11 +114,15 @@ def loopback(megabytes: float) -> None:
     server, client = make_server(time.monotonic()), make_client(time.monotonic())
     child = os.fork()
     if child == 0:
-        loop = UdpLoop(
-            server,
-            listening,
-            lambda event: server.send(event.connection, bytes(41)) if isinstance(event, Message) else None,
-        )
+        got = 0
+
+        def take(event: object) -> None:
+            nonlocal got
+            if isinstance(event, Message):
+                got += 1
+                server.set_state(event.connection, got.to_bytes(4, "big") + bytes(117))
+
+        loop = UdpLoop(server, listening, take)
         while not client_gone(server):
             loop.step(0.5)
         spent = time.process_time()
@@ -127,16 +133,16 @@ def loopback(megabytes: float) -> None:
 
     def on_event(event: object) -> None:
         nonlocal answered
-        answered += isinstance(event, Message)
+        answered = int.from_bytes(event.data[:4], "big") if isinstance(event, State) else answered
 
     loop = UdpLoop(client, sock, on_event)
     client.connect(address, time.monotonic())
-    while client.state != "connected":
+    while not client.connected:
         loop.step(1.0)
     payload, sent = os.urandom(CHUNK), 0
     began, worked = time.perf_counter(), time.process_time()
     while answered < count:
-        while sent < count and client.writable(CHUNK):
+        while sent < count and client.room() >= CHUNK:
             client.send(payload)
             sent += 1
         loop.step(0.5)
@@ -198,48 +204,29 @@ def strangers() -> None:
     print(f"  1,200 bytes of noise               {each(offered(b'X' + os.urandom(1199)), 2000):8.1f}")
     print(f"  a packet of no connection          {each(offered(b'@' + os.urandom(1199)), 2000):8.1f}")
     handshake(server, make_client(1.0), 1.0)
-    noise = b"@" + next(iter(server._connections)) + (10**6).to_bytes(4, "big") + os.urandom(1187)
+    noise = b"@" + next(iter(server._sessions)) + (10**6).to_bytes(4, "big") + os.urandom(1187)
     print(f"  a forged packet of a live session  {each(offered(noise), 500):8.1f}")
 
 
-def links() -> None:
-    """Through the simulated network of the tests: time to a session, and the rate for 60 seconds."""
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-    from bridge.channel.simulation import Faults, Network
-    from bridge.channel.world import RobotProgram, ServerProgram
-
-    print("\nseconds to a session, round trip 40 ms, 400 seeds     median    95 %")
-    for loss in (0.0, 0.1, 0.2, 0.3):
-        times = []
-        for seed in range(400 if loss else 2):
-            network = Network(seed, Faults(loss=loss, delay=0.02))
-            ServerProgram(network)
-            robot = RobotProgram(network, [])
-            events: list[float] = []
-            robot.host.on_event = lambda event, network=network, events=events: (
-                events.append(network.now) if isinstance(event, Connected) else None
-            )
-            network.run(lambda events=events: bool(events))
-            times.append(events[0] - 1000.0)
-        print(f"  {loss:4.0%} loss {statistics.median(times):46.2f}{statistics.quantiles(times, n=20)[-1]:8.2f}")
-    print("\nkB/s in the first 60 s, jitter 5 %      no loss     10 %     30 %")
-    for round_trip in (0.05, 0.2, 0.6):
-        row = []
-        for loss in (0.0, 0.1, 0.3):
-            network = Network(1, Faults(loss=loss, delay=round_trip / 2, jitter=round_trip / 20))
-            hub = ServerProgram(network)
-            robot = RobotProgram(network, [bytes(CHUNK)] * 10_000_000)
-            network.run(lambda robot=robot: robot.sent is not None)
-            began, end = network.now, network.now + 60.0
-            stored = hub.stored.setdefault("robot_1", [])
-            network.run(lambda network=network, end=end, stored=stored: network.now > end or len(stored) > 4000)
-            row.append(len(stored) * CHUNK / (network.now - began) / 1e3)
-        print(f"  round trip {round_trip * 1000:3.0f} ms" + " " * 16 + "".join(f"{rate:9.0f}" for rate in row))
+def links(seeds: int, commit: str | None) -> None:
+    """channel_links.py over the sources here, then over those of another commit."""
+    here = Path(__file__).resolve().parent.parent
+    program = [sys.executable, str(here / "benchmarks/channel_links.py"), str(seeds)]
+    print(f"\nsimulated links, {seeds} seeds", flush=True)
+    subprocess.run(program, env={**os.environ, "PYTHONPATH": f"{here}/src:{here}/tests"}, check=True)
+    if commit is not None:
+        with tempfile.TemporaryDirectory() as there:
+            archive = ["git", "archive", "--output", f"{there}/sources.tar", commit, "src", "tests"]
+            subprocess.run(archive, cwd=here, check=True)
+            subprocess.run(["tar", "xf", "sources.tar"], cwd=there, check=True)
+            print(f"\nthe same at {commit}", flush=True)
+            subprocess.run(program, env={**os.environ, "PYTHONPATH": f"{there}/src:{there}/tests"}, check=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--link", action="store_true", help="also simulate links with loss")
+    parser.add_argument("--link", type=int, nargs="?", const=100, metavar="SEEDS", help="also simulate links with loss")
+    parser.add_argument("--beside", metavar="COMMIT", help="with --link: the same at this commit")
     chosen = parser.parse_args()
     print(f"{platform.python_implementation()} {platform.python_version()} on {platform.machine()}, "
           f"{os.cpu_count()} cores; SM3: {sm3.ENGINE}")
@@ -259,7 +246,7 @@ def main() -> None:
         print(f"  {mode.name.lower():9s} {columns[0]:18.2f}{columns[1]:12.2f}")
     strangers()
     if chosen.link:
-        links()
+        links(chosen.link, chosen.beside)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ BESIDE = {".js": "JavaScript", ".mjs": "JavaScript", ".html": "JavaScript", ".lu
 
 PARTS = {
     "cli": ("__main__.py", "cli", "terminal.py"),
-    "operator, config, identity, errors": ("operator", "config", "identity.py", "errors.py", "__init__.py"),
+    "operator, config, identity, errors": ("operator", "config", "identity.py", "files.py", "errors.py", "__init__.py"),
     "capture": ("capture",),
     "log": ("log",),
     "channel": ("channel",),

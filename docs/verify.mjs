@@ -14,12 +14,12 @@
 
 import { readFileSync } from 'node:fs'
 import { parseArgs } from 'node:util'
-import { Contract, JsonRpcProvider, getBytes, keccak256 } from 'ethers'
+import { Contract, JsonRpcProvider, id as keccakOfText, getBytes, keccak256 } from 'ethers'
 import { Decompress } from 'fzstd'
 import { sm2, sm3, sm4 } from 'sm-crypto-v2'
 import evidence from '../src/rosbridge_eth/reading/evidence.js'
 
-const { big, certificate, chunkOf, element, hex, isSigned, join, lineOf, logOf, signer, word } = evidence
+const { big, certificate, chunkOf, element, hex, isSigned, join, lineOf, signer, word } = evidence
 const ABI = [
   `function standings(bytes32[] Tks) view returns (tuple(address account, bytes32 certificatesHash, bool revoked,
      uint256 chunks, bytes32 tail, uint256 balance, uint256 dataBlock, uint256 changedBlock)[])`,
@@ -99,71 +99,31 @@ function open(chunk, log, readerKey) {
   return lines
 }
 
-// What one Zstandard frame holds (RFC 8878, 3.1.1), with zeros up to 64 bytes behind it: within 4 MiB of window and content,
-// without a dictionary, of the size and with the checksum that it says it has. Where it ends its blocks say.
+// What the Zstandard frame holds (RFC 8878, 3.1.1), with zeros up to 64 bytes behind it. Its header has one form, so its size
+// and its window are known before anything is unpacked. Where it ends its blocks say.
 function unpacked(data) {
-  if (hex(data.slice(0, 4)) !== '28b52ffd') throw new Error('no frame')
-  const descriptor = data[4]
-  const [single, checked, size] = [(descriptor >> 5) & 1, (descriptor >> 2) & 1, [0, 2, 4, 8][descriptor >> 6]]
-  if (descriptor & 8) throw new Error('a reserved bit')
-  const little = (from, length) => big(data.slice(from, from + length).reverse())
-  let at = 5
-  const [exponent, mantissa] = single ? [0, 0] : [10 + (data[at] >> 3), data[at++] & 7]
-  let window = 2 ** exponent * (1 + mantissa / 8)
-  const dictionary = [0, 1, 2, 4][descriptor & 3]
-  if (dictionary && little(at, dictionary)) throw new Error('a dictionary')
-  at += dictionary
-  const sizes = size || single
-  const length = Number(little(at, sizes)) + (size === 2 ? 256 : 0)
-  at += sizes
-  if (single) window = length
-  if (window > MAX.plaintext) throw new Error('a window above 4 MiB')
-  const most = Math.min(window, MAX.block)
+  const little = (at, length) => Number(big(data.slice(at, at + length).reverse()))
+  const size = little(5, 4)
+  if (hex(data.slice(0, 5)) !== '28b52ffda0' || size > MAX.plaintext) throw new Error('no frame in the one form')
+  let end = 9
   for (let last = 0; !last;) {
-    if (at + 3 > data.length) throw new Error('the frame has no end')
-    const [block, kind] = [Number(little(at, 3)) >> 3, (data[at] >> 1) & 3]
-    last = data[at] & 1
-    if (kind === 3 || block > most) throw new Error('no block')
-    at += 3 + (kind === 1 ? 1 : block)
+    if (end + 3 > data.length) throw new Error('the frame has no end')
+    const [block, kind] = [little(end, 3) >> 3, (data[end] >> 1) & 3]
+    last = data[end] & 1
+    if (kind === 3 || block > Math.min(size, MAX.block)) throw new Error('no block')
+    end += 3 + (kind === 1 ? 1 : block)
   }
-  const end = at + (checked ? 4 : 0)
   const padding = data.slice(end)
   if (end > data.length || padding.length >= 64 || padding.some((byte) => byte)) throw new Error('no padding')
   const parts = []
   let total = 0
   new Decompress((part) => {
     total += part.length
-    if (total > MAX.plaintext) throw new Error('more than 4 MiB')
+    if (total > size) throw new Error('another size')
     parts.push(Buffer.from(part))
   }).push(data.slice(0, end), true)
-  const content = Buffer.concat(parts)
-  if (sizes && content.length !== length) throw new Error('another size')
-  if (checked && (xxh64(content) & 0xffffffffn) !== little(at, 4)) throw new Error('another checksum')
-  return content
-}
-
-// XXH64 with seed 0 (xxHash, "XXH64 algorithm description"), of which a frame's checksum is the lower half.
-function xxh64(data) {
-  const [p1, p2, p3, p4, p5] = [
-    0x9e3779b185ebca87n, 0xc2b2ae3d27d4eb4fn, 0x165667b19e3779f9n, 0x85ebca77c2b2ae63n, 0x27d4eb2f165667c5n]
-  const u64 = (x) => BigInt.asUintN(64, x)
-  const turn = (x, n) => u64((x << n) | (x >> (64n - n)))
-  const round = (sum, lane) => u64(turn(u64(sum + lane * p2), 31n) * p1)
-  let at = 0
-  let hash = p5
-  if (data.length >= 32) {
-    const v = [u64(p1 + p2), p2, 0n, u64(-p1)]
-    for (; at + 32 <= data.length; at += 32) v.forEach((one, n) => (v[n] = round(one, data.readBigUInt64LE(at + 8 * n))))
-    hash = u64(turn(v[0], 1n) + turn(v[1], 7n) + turn(v[2], 12n) + turn(v[3], 18n))
-    for (const one of v) hash = u64((hash ^ round(0n, one)) * p1 + p4)
-  }
-  hash = u64(hash + BigInt(data.length))
-  for (; at + 8 <= data.length; at += 8) hash = u64(turn(hash ^ round(0n, data.readBigUInt64LE(at)), 27n) * p1 + p4)
-  for (; at + 4 <= data.length; at += 4) hash = u64(turn(hash ^ u64(BigInt(data.readUInt32LE(at)) * p1), 23n) * p2 + p3)
-  for (; at < data.length; at++) hash = u64(turn(hash ^ u64(BigInt(data[at]) * p5), 11n) * p1)
-  hash = u64((hash ^ (hash >> 33n)) * p2)
-  hash = u64((hash ^ (hash >> 29n)) * p3)
-  return hash ^ (hash >> 32n)
+  if (total !== size) throw new Error('another size')
+  return Buffer.concat(parts)
 }
 
 // --- the reading
@@ -180,8 +140,8 @@ const provider = new JsonRpcProvider(options.node, undefined, { staticNetwork: t
 const contract = new Contract(options.contract, ABI, provider)
 const { chainId } = await provider.getNetwork()
 const genesis = (await provider.getBlock(0)).hash
-const log = logOf(chainId, getBytes(genesis), getBytes(options.contract), options.robot)
-const tk = '0x' + hex(log.slice(32))
+const tk = keccakOfText(options.robot)
+const log = join(digest(word(chainId), getBytes(genesis), getBytes(options.contract)), getBytes(tk))
 const block = await provider.getBlockNumber()
 const [standing] = await contract.standings([tk], { blockTag: block })
 const end = Number(standing.chunks)

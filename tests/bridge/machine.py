@@ -47,10 +47,10 @@ class Machine:
         self.loop = UdpLoop(self.client, sock, self.events.append)
         self.client.connect(address, time.monotonic())
 
-    def until(self, state: str) -> None:
+    def until(self, phase: str) -> None:
         end = time.monotonic() + PATIENCE
-        while self.client.state != state:
-            assert time.monotonic() < end, self.client.state
+        while self.client.phase != phase:
+            assert time.monotonic() < end, self.client.phase
             self.loop.step(0.2)
 
     def close(self) -> None:

@@ -571,7 +571,7 @@ def test_a_clone_is_told_on_both_machines_and_by_the_server(
     assert TWICE in told(caplog, "sender") and FORKED in told(caplog, "sender")
     assert FORKED in told(caplog, "reception") and "robot_1" in world.reception.forked
     world.confirm()
-    world.pass_time(5)
+    world.pass_time(25)  # each has its turn; they come ever more slowly
     stored = {*world.stored_lines()}
     held = [machine for machine in world.machines if not stored.issuperset(machine.lines)]
     assert len(held) == 1, "one of the two goes on, the other is held"

@@ -74,7 +74,8 @@ def test_an_incomplete_result_does_not_pass(result: DemoResult) -> None:
 
 
 def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosbridge_eth.robot.loop.RING", 4)  # what is in it when the robot is stopped is captured, too
+    # What waits when the robot is stopped is captured, too.
+    monkeypatch.setattr("rosbridge_eth.robot.loop.REPLAYED_BYTES", 5000)
     monkeypatch.setattr("rosbridge_eth.robot.loop.TAKE", 1)
 
     def stop_early(robot: Robot) -> None:

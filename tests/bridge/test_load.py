@@ -45,8 +45,7 @@ def test_more_robots_than_their_address_may_fail_at_once_wait_and_get_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The caps on strangers delay honest robots behind one address, and keep none of them out."""
-    monkeypatch.setattr(shard, "ServerConfig", partial(
-        ServerConfig, max_half_open=4, source_rate=1.0, source_burst=3.0))  # fmt: skip
+    monkeypatch.setattr(shard, "ServerConfig", partial(ServerConfig, max_half_open=4))
     operator = load.Operator(tmp_path, "embedded", "sqlite", 24, lambda stage: None)
     try:
         figures = load.run(operator, 24, 2, limit=120)

@@ -70,7 +70,6 @@ def test_the_first_machine_gets_its_session_back_and_that_is_told_too(
     end = time.monotonic() + 2 * PATIENCE
     while len(warnings(caplog)) < 2 and time.monotonic() < end:
         for one in machines:
-            one.client.expecting(True)  # it waits for an answer that goes to the other
             one.loop.step(0.05)
     assert any(FORKED in warning for warning in warnings(caplog)) and "robot_1" in serving.worker.reception.forked
     for one in machines:

@@ -15,7 +15,7 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, stream_line
-from rosbridge_eth.channel import Client, ClientConfig, Connected, Message
+from rosbridge_eth.channel import Client, ClientConfig, Connected, State
 from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import NetworkError, SourceError, StoreError
@@ -24,11 +24,13 @@ from rosbridge_eth.log.database import DiskFull
 from rosbridge_eth.log.hop import ServerState, decode_offer
 from rosbridge_eth.log.store import NOWHERE, place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.robot.loop import MAX_UNSPOOLED, RING, Robot
+from rosbridge_eth.robot.loop import MAX_UNSPOOLED, REPLAYED_BYTES, Robot
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from rosbridge_eth.robot.spool import Spool
 
+MANY = REPLAYED_BYTES // 300
+"""Messages, more than wait."""
 TOPIC = "/robot_1/odom"
 PLACE = Log(bytes(32), robot_id("robot_1"))
 NOW = datetime.now(UTC)
@@ -79,7 +81,7 @@ def make(tmp_path: Path) -> Iterator[Callable[[int], Robot]]:
 def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    robot = make(3 * RING)
+    robot = make(MANY)
     append, full = robot.spool.append, [True]
 
     def maybe(chunk: object) -> None:
@@ -99,12 +101,12 @@ def test_while_the_spool_takes_nothing_a_bag_waits_and_then_all_of_it_is_kept(
         if full[0] and len(robot._unspooled) >= MAX_UNSPOOLED:
             seen.append(robot.captured)
             full[0] = len(seen) < 50
-        if robot.captured == 3 * RING and not robot._unspooled:
+        if robot.captured == MANY and not robot._unspooled:
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert len(set(seen)) == 1 and seen[0] < 3 * RING, "nothing more is captured while nothing can be kept"
-    assert robot.captured == 3 * RING
+    assert len(set(seen)) == 1 and seen[0] < MANY, "nothing more is captured while nothing can be kept"
+    assert robot.captured == MANY
     assert "the spool: the disk is full" in caplog.text
     assert "the spool: works again" in caplog.text
     assert f"{robot.chunks} chunks not yet at the server" in robot.summary
@@ -168,11 +170,11 @@ def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(
     robot, sent = make(10), list[bytes]()
     sender, spool = robot.sender, robot.spool
     with closing(spool), closing(robot.loop):
-        monkeypatch.setattr(robot.client, "writable", lambda size=0: True)
+        monkeypatch.setattr(robot.client, "room", lambda: 1 << 16)
         monkeypatch.setattr(robot.client, "send", sent.append)
         [chunk] = robot.writer.finish(0)
         spool.append(chunk)
-        robot.handle(Message(b"", ServerState().encode(), robot.client))  # type: ignore[arg-type]
+        robot.handle(State(ServerState().encode()))
         robot._send(0.0)
         assert [decode_offer(offer) for offer in sent] == [(chunk.encoded, b"")]
         here = place_of(chunk.header)
@@ -183,7 +185,7 @@ def test_what_the_spool_could_not_note_of_the_servers_word_is_noted_later(
             raise full
 
         monkeypatch.setattr(spool, "confirmed", fails)
-        robot.handle(Message(b"", said, robot.client))  # type: ignore[arg-type]
+        robot.handle(State(said))
         robot._send(1.0)
         assert robot.spool_trouble.why == str(full) and len(spool.rows(NOWHERE, 9)) == 1
         monkeypatch.setattr(spool, "confirmed", confirmed)
@@ -248,7 +250,7 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
 ) -> None:
     robot = make(1000)
     Full(robot, monkeypatch)
-    for name, value in {"LOSSES_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3, "RING": 64}.items():
+    for name, value in {"LOSSES_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3}.items():
         monkeypatch.setattr(f"rosbridge_eth.robot.loop.{name}", value)
     waiting: list[int] = []
 
@@ -261,7 +263,7 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
 
     robot.run(on_turn=on_turn)
     assert waiting[-1] <= 4
-    assert re.search(r"[1-9]\d+ messages lost, since the spool took nothing", robot.summary), "what the ring held"
+    assert re.search(r"[1-9]\d+ messages lost, since the spool took nothing", robot.summary), "what the queue held"
 
 
 def test_a_source_that_ended_while_the_spool_took_nothing_is_kept_when_it_does(
@@ -289,7 +291,7 @@ def test_a_server_that_says_what_is_no_message_does_not_keep_a_robot_from_captur
     make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot = make(100)
-    noise = Message(b"", b"\xff", robot.client)  # type: ignore[arg-type]
+    noise = State(b"\xff")
     monkeypatch.setattr(robot.loop, "step", lambda longest: robot.handle(noise))
     robot.run(on_turn=lambda: robot.stop() if robot.captured == 100 else None)
     assert f"{robot.chunks} chunks not yet at the server: the server says what is no message" in robot.summary

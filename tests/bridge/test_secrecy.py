@@ -76,7 +76,7 @@ class Seen:
 
         def secrets_of_session(*arguments: Any) -> SessionSecrets:
             made = SessionSecrets(*arguments)
-            seen.session_keys += [made.client, made.server, made.client_finished, made.server_finished]
+            seen.session_keys += [made.client, made.server, made.finished]
             return made
 
         class Kept(nodes.EmbeddedChain):
@@ -155,7 +155,7 @@ def telltales(result: DemoResult) -> set[bytes]:
 
 def test_the_run_was_harmed_and_still_complete(seen: Seen) -> None:
     assert seen.result.passed
-    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 8
+    assert len(seen.passphrases) == 3 and len(seen.session_keys) >= 6
     assert len(seen.keys) > 20
 
 

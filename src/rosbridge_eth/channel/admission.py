@@ -1,16 +1,9 @@
-"""What a server does before it trusts a datagram: cookies, and limits on what strangers cost it.
-
-A hostile HELLO costs one keyed hash and leaves no trace. A PROOF costs
-signatures, so it is admitted by its source (an address that proved, with a
-cookie, that it can receive) and by the share of time that handshakes may take.
-"""
+"""Cookies, by which a stranger shows that it receives at its address, and token buckets, which bound a rate."""
 
 from __future__ import annotations
 
 import hmac
-from collections import OrderedDict
 from hashlib import blake2s
-from ipaddress import ip_address
 
 from rosbridge_eth.channel.wire import COOKIE_SIZE, Hello
 
@@ -19,7 +12,7 @@ Address = tuple[str, int]
 
 
 class Cookies:
-    """Cookies under one 32-byte key, shared by the processes of a server.
+    """Cookies under one 32-byte key.
 
     A cookie is the time (8 bytes, ms) and a keyed hash of it, the address, and the HELLO's fields.
     """
@@ -62,52 +55,9 @@ class TokenBucket:
     def ready_at(self) -> float:
         """When `available` will be above zero, if nothing is charged until then; to be asked after `available`.
 
-        Rounded up, or a timer may fire a hair too early and find nothing to do.
+        Rounded up, since a timer that fires too early would find nothing to do.
         """
         return self._at + max(0.0, -self.level) / self.rate + 1e-4
 
     def charge(self, amount: float) -> None:
         self.level = min(self.burst, self.level - amount)
-
-
-class Sources:
-    """A token bucket per source: an IPv4 address or an IPv6 /64, the `capacity` most recent ones.
-
-    A handshake that succeeds gives its token back, so many honest robots
-    behind one address are not slowed down; what fails is.
-    """
-
-    def __init__(self, rate: float, burst: float, capacity: int) -> None:
-        self.rate, self.burst, self.capacity = rate, burst, capacity
-        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._buckets)
-
-    @staticmethod
-    def _source(address: Address) -> str:
-        try:
-            ip = ip_address(address[0].partition("%")[0])
-        except ValueError:
-            return address[0]
-        ip = getattr(ip, "ipv4_mapped", None) or ip
-        return str(ip) if ip.version == 4 else ip.exploded[:19]
-
-    def take(self, address: Address, now: float) -> bool:
-        """One token for a handshake from `address`; False if there is none."""
-        source = self._source(address)
-        bucket = self._buckets.get(source)
-        if bucket is None:
-            bucket = self._buckets[source] = TokenBucket(self.rate, self.burst, now)
-            if len(self._buckets) > self.capacity:
-                self._buckets.popitem(last=False)
-        self._buckets.move_to_end(source)
-        if bucket.available(now) < 1:
-            return False
-        bucket.charge(1)
-        return True
-
-    def give_back(self, address: Address) -> None:
-        bucket = self._buckets.get(self._source(address))
-        if bucket is not None:
-            bucket.charge(-1)

@@ -1,4 +1,4 @@
-"""A client of the channel: connects, stays connected, sends and hands out messages. Sans-IO."""
+"""A client of the channel: connects, stays connected, sends messages and hears the server's state. Sans-IO."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from enum import StrEnum
 
 from rosbridge_eth.channel import events, wire
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import ClientConfig, Drop, End, Event
-from rosbridge_eth.channel.handshake import ClientHandshake, HandshakeRefused, Randomness
-from rosbridge_eth.channel.session import MAX_MESSAGE, NEVER, RECEIVE_SEGMENTS, Early, Session
-from rosbridge_eth.channel.wire import Assembly, Hello, Kind, Malformed, Reason
+from rosbridge_eth.channel.events import ClientConfig, Drop, End, Event, Refused, close_frame, parse_close
+from rosbridge_eth.channel.handshake import Agreed, ClientHandshake, Randomness
+from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
+from rosbridge_eth.channel.transfer import MAX_MESSAGE, NEVER, Sending
+from rosbridge_eth.channel.wire import Answer, Assembly, Hello, Kind, Malformed, Reason
 from rosbridge_eth.identity import Identity, Trust
 
 FIRST_RETRY = 0.1  # s until a HELLO is repeated, where no round trip was measured yet
@@ -23,13 +24,16 @@ RECONNECT_MIN, RECONNECT_MAX = 0.25, 10.0
 """s before another handshake; it grows from one to the other, less up to a half by chance."""
 SESSION_SECONDS = (2700.0, 3600.0)
 """The age at which a session is ended and another made is drawn between the two."""
-KEEP_ALIVE = 10.0
-"""s without a packet after which a client pings; a third of it while it waits for something."""
+SHORT_SESSION = 60.0
+"""s; a session that ends sooner counts as an attempt that failed."""
+PROBE_FIRST, KEEP_ALIVE = 1.0, 10.0
+"""s without a packet after which the server is probed: the first after a message was sent, doubled up to the second."""
+SILENCE, SILENCE_PTOS = 10.0, 8
+"""s, and probe timeouts, without a packet while one is not acknowledged, after which a new session is made."""
 MAX_BAD_OFFERS = 8
 """Offers that do not hold, after which an attempt is given up: nobody makes a client verify all day."""
 CLOSES = 2
-ACCEPTED_SIZE = 8
-PATIENCE_PTOS = 8
+LATEST_MS = 1 << 47  # of the server's clock: the year 6429
 _NO_ANSWER = events.HandshakeFailed("the server does not answer")
 _HINTS = {
     Reason.CERTIFICATE: "the server seems to refuse this identity's certificates",
@@ -39,22 +43,52 @@ _HINTS = {
 }
 
 
-class State(StrEnum):
+class Phase(StrEnum):
     """Where a client stands; docs/channel.md has what leads from one to another."""
 
     IDLE = "idle"  # made, or closed: nothing is sent
     GREETING = "greeting"  # HELLO sent, waiting for a COOKIE
     PROVING = "proving"  # PROOF sent, waiting for an OFFER
-    FINISHING = "finishing"  # FINISHED sent, waiting for ACCEPTED
+    CONFIRMING = "confirming"  # the server is probed under the session's keys, waiting for its first packet
     CONNECTED = "connected"
     WAITING = "waiting"  # between two attempts
 
 
-_TAKES = {State.GREETING: (Kind.COOKIE,), State.PROVING: (Kind.OFFER, Kind.REFUSAL)}
+_TAKES = {Phase.GREETING: (Kind.COOKIE,), Phase.PROVING: (Kind.OFFER, Kind.REFUSAL)}
 
 
 def utc_now() -> datetime:
     return datetime.now(UTC)
+
+
+class _Session:
+    """The keys of an OFFER that holds, and what is sent and heard under them."""
+
+    __slots__ = (
+        "_cid", "began", "expires", "heard", "interval", "opens", "peer", "replay", "seals", "sending", "state",
+    )  # fmt: skip
+
+    def __init__(self, agreed: Agreed, sending: Sending, now: float, lasts: float) -> None:
+        self.peer, self._cid = agreed.peer, agreed.told
+        self.seals, self.opens = Direction(agreed.secrets.client), Direction(agreed.secrets.server)
+        self.replay, self.sending = ReplayWindow(), sending
+        self.state = b""  # what the server's program said last
+        self.began = self.heard = now
+        self.expires = now + lasts
+        self.interval = PROBE_FIRST
+
+    def seal(self, number: int, frame: bytes) -> bytes:
+        return self.seals.seal(self._cid, number, frame)
+
+    def close(self, reason: End) -> bytes:
+        return self.seal(self.sending.take_number(), close_frame(reason))
+
+    def probe_at(self) -> float:
+        """When to ask for the server's state; never while an acknowledgement is due, which has it."""
+        return self.heard + self.interval if self.sending.oldest == NEVER else NEVER
+
+    def silent_at(self) -> float:
+        return max(self.heard, self.sending.oldest) + max(SILENCE, SILENCE_PTOS * self.sending.pto)
 
 
 class Client:
@@ -63,8 +97,7 @@ class Client:
     now: monotonic seconds, the same clock in every call. wall: the clock that certificates are checked against.
     server_name: the server's name in its certificate; None takes any server of the operator.
 
-    A session that is lost is made anew, after a growing wait; what was sent and not answered is the program's to send
-    again. Not thread-safe.
+    A session that is lost is made anew, after a growing wait. Not thread-safe.
     """
 
     def __init__(
@@ -72,7 +105,7 @@ class Client:
         wall: Callable[[], datetime] = utc_now, randomness: Randomness | None = None,
     ) -> None:  # fmt: skip
         self.config = config
-        self.state = State.IDLE
+        self.phase = Phase.IDLE
         self._identity, self._trust, self._server_name = identity, trust, server_name
         self._wall, self._randomness = wall, randomness or Randomness()
         self._now = now
@@ -82,54 +115,42 @@ class Client:
         self._outbox: list[bytes] = []
         self._cid = b""
         self._handshake: ClientHandshake | None = None
+        self._assembly, self._bad_offers = Assembly(), 0
         self._flight: list[bytes] = []  # the handshake message that waits for its answer
         self._flight_at = 0.0
         self._rtt: float | None = None
         self._retry_after = self._retry_at = self._deadline = NEVER
         self._failures = 0
-        self._silences = 0  # sessions that ended in silence since anything was stored
-        self._patience = config.patience
-        self._expecting_since = NEVER
-        self._bad_offers = 0
         self._why = _NO_ANSWER
-        self._assembly = Assembly()
-        self._session: Session | None = None
+        self._session: _Session | None = None
 
     # What the program calls
+
+    @property
+    def connected(self) -> bool:
+        return self.phase is Phase.CONNECTED
 
     def connect(self, address: Address, now: float) -> None:
         """Begin to connect to `address`, and go on until `close`."""
         self._address = address
         self._greet(now)
 
-    def writable(self, size: int = MAX_MESSAGE) -> bool:
-        """Whether `send` takes a message of `size` bytes at this moment."""
-        return self.state is State.CONNECTED and self._session is not None and self._session.has_room(size)
+    def room(self) -> int:
+        """The longest message, in bytes, that `send` takes at this moment; 0 where there is no session."""
+        return self._session.sending.room() if self._session is not None and self.connected else 0
 
-    def send(self, payload: bytes) -> None:
+    def send(self, message: bytes) -> None:
         """Send a message of 0 to MAX_MESSAGE bytes; they arrive in order, each once, while this session lasts.
 
-        Raises NotConnected, or Full while too much is not acknowledged.
+        Raises Full where the message is longer than `room` says, or there is no session.
         """
-        if self.state is not State.CONNECTED or self._session is None:
-            raise events.NotConnected("there is no session; wait until it is connected")
-        self._session.send(payload)
+        if len(message) > MAX_MESSAGE:
+            raise ValueError(f"a message is at most {MAX_MESSAGE} bytes, not {len(message)}")
+        if self._session is None or not self.connected or len(message) > self.room():
+            raise events.Full("no session, or no room until some of what was sent is acknowledged")
+        self._session.sending.write(message)
+        self._session.interval = PROBE_FIRST
         self._counts["messages_sent"] += 1
-
-    def expecting(self, waits: bool) -> None:
-        """Say whether the program waits for a message of the server's; False with each new session.
-
-        While it does, a server from which no packet comes for `patience` is given up and a new session made.
-        """
-        if not waits:
-            self._expecting_since = NEVER
-        elif self._expecting_since == NEVER:
-            self._expecting_since = self._now
-
-    def progressed(self) -> None:
-        """Say that the server has stored something: this client's patience is what it was at first."""
-        self._silences = 0
-        self._patience = self.config.patience
 
     def next_event(self) -> Event | None:
         """The oldest event that was not fetched, or None. Fetch them all in each turn: nothing bounds them."""
@@ -137,15 +158,15 @@ class Client:
 
     def close(self, now: float) -> None:
         """End the session, or the attempt at one. The server is told twice, and else learns it by silence."""
-        if self.state is State.CONNECTED and self._session is not None:
-            self._outbox += [self._session.close_datagram(End.CLOSED) for _ in range(CLOSES)]
+        if self.connected and self._session is not None:
+            self._outbox += [self._session.close(End.CLOSED) for _ in range(CLOSES)]
             self._events.append(events.Disconnected(End.CLOSED, self._cid, self._session.peer))
-        self.state = State.IDLE
+        self.phase = Phase.IDLE
         self._session = self._handshake = None
 
     def statistics(self) -> Counter[str]:
         """What was counted since this client was made, each Drop among it, and whether it is connected."""
-        return Counter({**self._counts, "connections": int(self.state is State.CONNECTED)})
+        return Counter({**self._counts, "connections": int(self.connected)})
 
     # What the network and the clock call
 
@@ -156,22 +177,23 @@ class Client:
         self._counts["bytes_received"] += len(data)
         try:
             if address != self._address:
-                self._counts[Drop.ADDRESS] += 1
-            elif data and data[0] == Kind.DATA:
+                raise Refused(Drop.ADDRESS)
+            if data and data[0] == Kind.DATA:
                 self._on_data(data, now)
             else:
                 self._on_handshake(data, now)
         except Malformed:
             self._counts[Drop.MALFORMED] += 1
+        except Refused as refused:
+            self._counts[refused.drop] += 1
 
     def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
         """What may go to the network now."""
         self._now = now
-        session = self._session
-        if session is not None:
-            while (datagram := session.next_datagram(now)) is not None:
-                self._outbox.append(datagram)
-            self._look_for_end(session, now)
+        while (session := self._session) is not None and (packet := session.sending.next(now)) is not None:
+            self._outbox.append(session.seal(*packet))
+            if session.sending.packets >= SESSION_PACKETS:
+                self._end(End.EXPIRED, now)
         out, self._outbox = self._outbox, []
         self._counts["datagrams_sent"] += len(out)
         self._counts["bytes_sent"] += sum(map(len, out))
@@ -180,41 +202,33 @@ class Client:
     def next_timer(self) -> float | None:
         """When to call `handle_timer`, on the clock of `now`; None for never."""
         session = self._session
-        if self.state is State.IDLE:
+        if self.phase is Phase.IDLE:
             return None
+        when = min(self._retry_at, self._deadline)
         if session is None:
-            return min(self._retry_at, self._deadline)
-        ends = min(session.expires, self._deadline, self._silent_at(session))
-        return min(session.timer(self._now), self._ping_at(session), ends)
+            return when
+        return min(when, session.sending.timer(self._now), session.probe_at(), session.silent_at(), session.expires)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`; harmless if nothing is."""
         self._now = now
         session = self._session
-        if self.state is State.IDLE:
+        if self.phase is Phase.IDLE:
             return
         if now >= self._deadline:
             self._fail(now)
-        elif session is not None:
-            session.handle_timer(now)
-            if now >= self._silent_at(session):
-                session.end(End.SILENT)
-            elif now >= self._ping_at(session):
-                session.ping()
-            self._look_for_end(session, now)
         elif now >= self._retry_at:
-            if self.state is State.WAITING:
+            if self.phase is Phase.WAITING:
                 self._greet(now)
             else:
                 self._send_flight(now)
-
-    def _ping_at(self, session: Session) -> float:
-        often = 1 if self._expecting_since == NEVER else 3
-        return session.last_received + KEEP_ALIVE / often if session.waiting_since == NEVER else NEVER
-
-    def _silent_at(self, session: Session) -> float:
-        waiting_since = min(session.waiting_since, self._expecting_since)
-        return max(session.last_received, waiting_since) + max(self._patience, PATIENCE_PTOS * session.pto)
+        elif session is not None and now >= min(session.silent_at(), session.expires):
+            self._end(End.EXPIRED if now >= session.expires else End.SILENT, now)
+        elif session is not None:
+            session.sending.handle_timer(now)
+            if now >= session.probe_at():
+                session.interval = min(2 * session.interval, KEEP_ALIVE)
+                session.sending.probe()
 
     # Handshake
 
@@ -222,13 +236,12 @@ class Client:
         return int.from_bytes(self._randomness.bytes(2), "big") / 65536
 
     def _greet(self, now: float) -> None:
-        self.state = State.GREETING
+        self.phase = Phase.GREETING
         self._cid = self._randomness.bytes(wire.CID_SIZE)
         self._handshake = ClientHandshake(self.config.mode, self._identity, self._cid, self._randomness)
         self._session = None
-        self._bad_offers = 0
+        self._assembly, self._bad_offers = Assembly(), 0
         self._why = _NO_ANSWER
-        self._assembly = Assembly()
         self._deadline = now + self.config.attempt_timeout
         self._counts["handshakes_begun"] += 1
         self._begin_flight([self._handshake.hello.datagram(Kind.HELLO, wire.HELLO_PADDING)], now)
@@ -239,7 +252,10 @@ class Client:
         self._send_flight(now)
 
     def _send_flight(self, now: float) -> None:
+        """Send the handshake message that waits for its answer; the last of them is a probe, sealed anew each time."""
         self._outbox = list(self._flight)
+        if self._session is not None:
+            self._session.sending.probe()
         self._flight_at = now
         self._retry_at = now + self._retry_after
         self._retry_after = max(self._retry_after, min(self._retry_after * RETRY_GROWTH, LAST_RETRY))
@@ -247,19 +263,23 @@ class Client:
     def _on_handshake(self, data: bytes, now: float) -> None:
         hello, rest = Hello.parse(data)
         handshake = self._handshake
-        if handshake is None or hello != handshake.hello or data[0] not in _TAKES.get(self.state, ()):
-            self._counts[Drop.UNEXPECTED] += 1
-        elif data[0] == Kind.COOKIE:
+        if handshake is None or hello != handshake.hello or data[0] not in _TAKES.get(self.phase, ()):
+            raise Refused(Drop.UNEXPECTED)
+        if data[0] == Kind.COOKIE:
             if len(rest) != wire.COOKIE_SIZE:
                 raise Malformed("a cookie of another length")
             # Since the last HELLO, whichever was answered: at worst the PROOF is repeated a little early.
             self._rtt = now - self._flight_at
-            self.state = State.PROVING
+            self.phase = Phase.PROVING
             self._begin_flight(hello.in_pieces(Kind.PROOF, rest, handshake.proof(rest)), now)
         elif data[0] == Kind.OFFER:
-            body = self._assembly.add(wire.parse_piece(rest))
+            piece = wire.parse_piece(rest)
+            body = self._assembly.add(piece)
             if body is not None:
+                self._assembly = Assembly()
                 self._on_offer(handshake, body, now)
+            elif piece[1] > len(self._flight):  # an offer of more datagrams than its proof: each draws one
+                self._send_flight(now)
         else:
             if len(rest) != 1 or rest[0] not in _HINTS:
                 raise Malformed("a reason that does not exist")
@@ -269,23 +289,18 @@ class Client:
     def _on_offer(self, handshake: ClientHandshake, body: bytes, now: float) -> None:
         try:
             agreed = handshake.accept(body, self._trust, server_name=self._server_name, at=self._wall())
-        except HandshakeRefused as refused:
-            self._counts[refused.drop] += 1
+        except Refused as refused:
             self._why = events.HandshakeFailed(f"the server's offer is refused: {refused}", refused.hint)
             self._bad_offers += 1
             if self._bad_offers >= MAX_BAD_OFFERS:
                 self._fail(now)
-            return
-        self.state = State.FINISHING
-        youngest, oldest = SESSION_SECONDS
-        self._session = Session(
-            agreed.peer, agreed.server_cid, agreed.secrets.client, agreed.secrets.server, now=now, rtt=self._rtt,
-            expires=now + youngest + (oldest - youngest) * self._chance(), early=Early(RECEIVE_SEGMENTS),
-            counts=self._counts,
-        )  # fmt: skip
-        self._session.send(agreed.finished)
+            raise
+        self.phase = Phase.CONFIRMING
         self._handshake = None
-        self._outbox = []
+        youngest, oldest = SESSION_SECONDS
+        lasts = youngest + (oldest - youngest) * self._chance()
+        self._session = _Session(agreed, Sending(now, self._rtt, self._counts), now, lasts)
+        self._begin_flight([], now)
 
     def _fail(self, now: float) -> None:
         self._events.append(self._why)
@@ -293,7 +308,7 @@ class Client:
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        self.state = State.WAITING
+        self.phase = Phase.WAITING
         self._session = self._handshake = None
         self._deadline = NEVER
         longest = min(RECONNECT_MIN * 2 ** min(self._failures, 16), RECONNECT_MAX)
@@ -303,50 +318,48 @@ class Client:
 
     def _on_data(self, data: bytes, now: float) -> None:
         session = self._session
-        if len(data) <= wire.DATA_OVERHEAD:
-            raise Malformed("a packet without a frame")
         if session is None or data[1:9] != self._cid:
-            self._counts[Drop.UNKNOWN_CONNECTION] += 1
-            return
-        if not session.receive(data, now):
-            return
-        if self.state is State.FINISHING and session.messages:
-            self._accepted(session, session.messages.pop(0))
-        for payload in session.messages:
-            self._counts["messages_received"] += 1
-            self._events.append(events.Message(self._cid, payload, session.peer))
-        session.messages.clear()
-        self._look_for_end(session, now)
+            raise Refused(Drop.UNKNOWN_CONNECTION)
+        number, frame = session.opens.open(data, session.replay)
+        newest = number > session.replay.highest
+        session.replay.mark(number)
+        session.heard = now
+        try:
+            if (reason := parse_close(frame)) is not None:
+                self._end(reason, now)
+            else:
+                self._on_answer(session, Answer.parse(frame), newest, now)
+        except Malformed:
+            self._end(End.PROTOCOL, now)
 
-    def _accepted(self, session: Session, payload: bytes) -> None:
-        """The server's first message: its wall clock in ms since 1970."""
-        milliseconds = int.from_bytes(payload, "big")
-        if len(payload) != ACCEPTED_SIZE or milliseconds > 2**47:
-            session.messages.clear()
-            session.end(End.PROTOCOL)
-            return
-        self.state = State.CONNECTED
-        self._deadline = NEVER
-        self._failures = 0
-        self._expecting_since = NEVER
-        longest = min(self.config.patience * 2**self._silences, self.config.patience_max)
-        self._patience = longest * (1 + self._chance() / 4)
-        self._counts["handshakes"] += 1
-        self._events.append(events.Connected(session.peer, self._cid, datetime.fromtimestamp(milliseconds / 1000, UTC)))
+    def _on_answer(self, session: _Session, answer: Answer, newest: bool, now: float) -> None:
+        if answer.time_ms > LATEST_MS:
+            raise Malformed("a time beyond any clock")
+        session.sending.acknowledged(answer, now)
+        if self.phase is Phase.CONFIRMING:
+            self.phase = Phase.CONNECTED
+            self._deadline = self._retry_at = NEVER
+            self._counts["handshakes"] += 1
+            when = datetime.fromtimestamp(answer.time_ms / 1000, UTC)
+            self._events.append(events.Connected(session.peer, self._cid, when))
+        if newest and answer.data not in (b"", session.state):
+            session.state = answer.data
+            self._events.append(events.State(answer.data))
+        elif newest and session.state and not answer.data:
+            session.sending.probe()  # nothing had come from here that was long enough for the state
 
-    def _look_for_end(self, session: Session, now: float) -> None:
-        reason = session.ended
-        if reason is None:
+    def _end(self, reason: End, now: float) -> None:
+        session = self._session
+        if session is None:
             return
         if reason in (End.PROTOCOL, End.EXPIRED):
-            self._outbox.append(session.close_datagram(reason))
-        if self.state is State.FINISHING:
+            self._outbox.append(session.close(reason))
+        if not self.connected:
             self._why = events.HandshakeFailed(f"the session ended before it began: {reason}")
             self._fail(now)
             return
         self._events.append(events.Disconnected(reason, self._cid, session.peer))
-        if reason is End.SILENT:
-            self._silences = min(self._silences + 1, 16)
+        self._failures = self._failures + 1 if now < session.began + SHORT_SESSION else 0
         if reason in (End.REPLACED, End.REVOKED):
             self._failures += 3  # whoever has our name, or took it away, is not to be fought over it
         self._wait(now)

@@ -1,7 +1,8 @@
 """Which packets are lost, and how fast to send. Loss and round trip after RFC 9002; the window is this project's.
 
-Names are RFC 9002's: smoothed RTT, RTT variance, PTO (probe timeout). A packet is lost when one sent three after it
-is acknowledged, or one sent later and 9/8 of a round trip have passed (6.1).
+Names are RFC 9002's: smoothed RTT, RTT variance, PTO (probe timeout). A packet is lost when one sent later is
+acknowledged and 9/8 of a round trip have passed (6.1.2); the threshold of three packets (6.1.1) is left out, since it
+takes reordering for loss.
 
 The window follows the queue that it makes, not loss, since radio loses without being full; see `Window`.
 Left out: ECN, state per path.

@@ -7,17 +7,13 @@ from datetime import datetime
 from enum import StrEnum
 from typing import NamedTuple
 
-from rosbridge_eth.channel.wire import Mode, Reason
+from rosbridge_eth.channel.wire import Frame, Malformed, Mode, Reason
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.identity import PeerIdentity
 
 
 class Full(NetworkError):
-    """No more is taken until some of what was sent is acknowledged; ask `writable` first."""
-
-
-class NotConnected(NetworkError):
-    """There is no session to send on; wait for Connected."""
+    """There is no session, or no more is taken until some of what was sent is acknowledged; ask `room` first."""
 
 
 class End(StrEnum):
@@ -32,6 +28,23 @@ class End(StrEnum):
     EXPIRED = "the session's time or packet numbers are used up"
 
 
+_CLOSE_CODES = (End.CLOSED, End.PROTOCOL, End.REPLACED, End.REVOKED, End.EXPIRED, End.SILENT)
+
+
+def close_frame(reason: End) -> bytes:
+    return bytes((Frame.CLOSE, _CLOSE_CODES.index(reason)))
+
+
+def parse_close(frame: bytes) -> End | None:
+    """Why the peer ends the session; None if it does not."""
+    if frame[0] != Frame.CLOSE:
+        return None
+    if len(frame) != 2 or frame[1] >= len(_CLOSE_CODES):
+        raise Malformed("a close for no reason that exists")
+    reason = _CLOSE_CODES[frame[1]]
+    return End.CLOSED_BY_PEER if reason is End.CLOSED else reason
+
+
 class Drop(StrEnum):
     """Why a datagram was dropped without a word; counted in an endpoint's `statistics`."""
 
@@ -40,8 +53,6 @@ class Drop(StrEnum):
     UNEXPECTED = "unexpected in this state"
     ADDRESS = "from another address"
     COOKIE = "cookie wrong or too old"
-    REPLAYED_HANDSHAKE = "handshake seen before"
-    SOURCE_LIMIT = "too many handshakes from the source"
     BUSY = "no time left for handshakes"
     HALF_OPEN = "too many half-open handshakes"
     CONNECTIONS = "too many connections"
@@ -51,6 +62,14 @@ class Drop(StrEnum):
     REPLAYED = "packet number seen before"
     TAG = "authentication failed"
     FULL = "no room to keep it until what comes before it is there"
+
+
+class Refused(Exception):
+    """A datagram is not accepted; `hint` is what its sender may be told."""
+
+    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
+        super().__init__(why)
+        self.drop, self.hint = drop, hint
 
 
 class Connected(NamedTuple):
@@ -65,7 +84,7 @@ class Connected(NamedTuple):
 
 
 class Disconnected(NamedTuple):
-    """The session ended. What it did not deliver is the program's to send again in the next one."""
+    """The session ended. Which messages arrived, the server's next state says."""
 
     reason: End
     connection: bytes
@@ -73,11 +92,17 @@ class Disconnected(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message of the peer's, in the order of its sending, once a session."""
+    """At a server: a message of a client's, in the order of its sending, each once a session."""
 
     connection: bytes
     payload: bytes
-    peer: PeerIdentity
+
+
+class State(NamedTuple):
+    """At a client: what the server's program says now, which takes the place of what it said before. The first of a
+    session follows Connected; later ones come when it has changed."""
+
+    data: bytes
 
 
 class HandshakeFailed(NamedTuple):
@@ -98,7 +123,7 @@ class Unresolved(NamedTuple):
     why: str
 
 
-Event = Connected | Disconnected | Message | HandshakeFailed | Unresolved
+Event = Connected | Disconnected | Message | State | HandshakeFailed | Unresolved
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,9 +132,6 @@ class ClientConfig:
 
     mode: Mode = Mode.EXCHANGE
     """The one it uses; it never falls back to another."""
-    patience: float = 10.0
-    patience_max: float = 60.0
-    """A client that waits and gets no packet for so long makes a new session; doubled each time, up to the second."""
     attempt_timeout: float = 8.0
     """A handshake that takes longer is begun anew."""
 
@@ -120,17 +142,13 @@ class ServerConfig:
 
     modes: tuple[Mode, ...] = (Mode.EXCHANGE,)
     """Those it takes; `transport`, which is not forward secret, only where it is named here."""
-    worker: int = 0
-    """This process's number among those that share the port (0 to 255): first byte of its connection ids."""
     session_seconds: float = 3900.0
     """A session that its client did not end by this age is ended."""
     max_half_open: int = 1024
+    """Handshakes that wait for pieces of a PROOF, and as many that wait for the client's first packet."""
     max_connections: int = 4096
     max_early: int = 50_000
     """Segments of all sessions that came too early (60 MB). Above it each session keeps a few, and else takes only
     what comes in order."""
-    source_rate: float = 10.0
-    source_burst: float = 400.0
-    """Handshakes that one source may fail per second, and at once."""
     handshake_share: float = 0.5
     """Share of time that handshakes may take."""

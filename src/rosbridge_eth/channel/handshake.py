@@ -6,20 +6,22 @@
     PROOF    the same, cookie, certificates, R_A,
              signature over H1                          ─────────▶  half open
              N_s, cid_s, certificates, R_B or C,
-             signature over H2, S_B, finished over H3   ◀─────────  OFFER
-    FINISHED S_A, finished over H4, sealed               ─────────▶  session
+             signature over H2, finished over H3        ◀─────────  OFFER
+    the first packet of the session that opens          ─────────▶  session
 
 Mode `exchange`: SM2 key exchange, GB/T 32918.3-2016, 6.1, client A, server B,
-ephemeral points R_A and R_B, confirmations S_B and S_A; ID = role | SM3 of the
-encryption certificate. K is 32 bytes. Forward secret.
+ephemeral points R_A and R_B; ID = role | SM3 of the encryption certificate.
+K is 32 bytes. Forward secret. The standard's confirmations S_B and S_A, which
+are optional there, are not used: `finished` and the first packet confirm K and
+the whole transcript.
 
 Mode `transport`: the server draws K (32 bytes) and sends C, K encrypted by SM2
 to the client's encryption certificate (GB/T 32918.4); the client verifies the
 server's signature before it decrypts. Not forward secret: who obtains the
 client's encryption key later opens what was recorded.
 
-Transcript hashes are SM3 over everything sent so far, from the HELLO on:
-H1 up to R_A, H2 up to R_B or C, H3 up to S_B, H4 all of it. Session keys come
+Transcript hashes are SM3 over everything sent so far, from the HELLO on: H1 up
+to R_A, H2 up to R_B or C, H3 up to the server's signature. Session keys come
 from K and H3 (protection), so they agree only if every byte did.
 """
 
@@ -34,7 +36,7 @@ from typing import NamedTuple
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import wire
-from rosbridge_eth.channel.events import Drop
+from rosbridge_eth.channel.events import Drop, Refused
 from rosbridge_eth.channel.protection import SessionSecrets, finished
 from rosbridge_eth.channel.wire import Hello, Malformed, Mode, Reason
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust
@@ -42,18 +44,9 @@ from smcrypto import SMCryptoError, sm2, sm3
 
 SHARED_SIZE = 32
 POINT_SIZE = 65
-CONFIRMATION_SIZE = 32
-NO_CONFIRMATION = bytes(CONFIRMATION_SIZE)
-"""S_A in mode `transport`, which has none."""
-
-
-class HandshakeRefused(Exception):
-    """The peer's handshake message is not accepted; `hint` is what it may be told."""
-
-    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
-        super().__init__(why)
-        self.drop = drop
-        self.hint = hint
+MAC_SIZE = 32
+ROOM_FOR_SECRET = bytes(256)
+"""Zeros behind a PROOF in mode `transport`, whose answer is longer by C: an answer is never longer than what asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +72,7 @@ def _exchange(mine: Identity, peer: PeerIdentity, ephemeral: sm2.PrivateKey, *, 
 
 def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
     version_and_mode = bytes((wire.VERSION, hello.mode))
-    return sm3.SM3(b"rosbridge-eth/2 handshake\0" + version_and_mode + hello.client_cid + hello.nonce + cookie)
+    return sm3.SM3(b"rosbridge-eth/3 handshake\0" + version_and_mode + hello.client_cid + hello.nonce + cookie)
 
 
 def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], list[int]]:
@@ -87,19 +80,19 @@ def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], lis
     try:
         parts, offsets = wire.parse_fields(body, len(lengths))
     except Malformed as error:
-        raise HandshakeRefused(Drop.MALFORMED, str(error)) from error
+        raise Refused(Drop.MALFORMED, str(error)) from error
     if any(length not in (None, len(part)) for length, part in zip(lengths, parts, strict=True)):
-        raise HandshakeRefused(Drop.MALFORMED, "a field has another length")
+        raise Refused(Drop.MALFORMED, "a field has another length")
     return parts, offsets
 
 
 class Agreed(NamedTuple):
-    """What a client has when a handshake is done: who the server is, the session's secrets, and S_A | finished."""
+    """What an end has of a handshake: who the peer is, the session's secrets, and at a client the server's cid, at a
+    server the body of its OFFER."""
 
     peer: PeerIdentity
     secrets: SessionSecrets
-    server_cid: bytes
-    finished: bytes
+    told: bytes
 
 
 class ClientHandshake:
@@ -120,97 +113,70 @@ class ClientHandshake:
         transcript.update(unsigned)
         signature = wire.fields([ids.sign(identity.signing_key, "handshake", b"client" + transcript.digest())])
         transcript.update(signature)
-        return unsigned + signature
+        return unsigned + signature + (b"" if self._ephemeral else ROOM_FOR_SECRET)
 
     def accept(self, body: bytes, trust: Trust, *, server_name: str | None, at: datetime) -> Agreed:
-        """Verify an OFFER's body; HandshakeRefused leaves this attempt as it was, ready for another."""
-        material_size, confirmation_size = (POINT_SIZE, CONFIRMATION_SIZE) if self._ephemeral else (None, 0)
-        lengths = (wire.NONCE_SIZE, wire.CID_SIZE, None, None, material_size, None, confirmation_size, None)
-        (_, server_cid, signing, encryption, material, signature, confirmation, mac), offsets = _parse(body, lengths)
+        """Verify an OFFER's body; Refused leaves this attempt as it was, ready for another."""
+        lengths = (
+            wire.NONCE_SIZE, wire.CID_SIZE, None, None, POINT_SIZE if self._ephemeral else None, None, MAC_SIZE,
+        )  # fmt: skip
+        (_, server_cid, signing, encryption, material, signature, mac), offsets = _parse(body, lengths)
         try:
             peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
             hint = Reason.EXPIRED if isinstance(error, ids.ExpiredCertificate) else None
-            raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
+            raise Refused(Drop.CERTIFICATE, str(error), hint) from error
         transcript = self._transcript.copy()
         transcript.update(body[: offsets[5]])
         try:
             ids.verify(peer.signing_certificate.public_key, "handshake", b"server" + transcript.digest(), signature)
-            transcript.update(body[offsets[5] : offsets[7]])
             if self._ephemeral is not None:
                 exchange = _exchange(self._identity, peer, self._ephemeral, initiator=True)
-                _, own = exchange.agree(material, SHARED_SIZE)
-                shared = exchange.confirm(confirmation)
+                shared, _ = exchange.agree(material, SHARED_SIZE, unconfirmed=True)
             else:
-                shared, own = self._identity.encryption_key.decrypt(material), NO_CONFIRMATION
+                shared = self._identity.encryption_key.decrypt(material)
         except SMCryptoError as error:
-            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold") from error
+            raise Refused(Drop.SIGNATURE, "the offer does not hold") from error
         if len(shared) != SHARED_SIZE:
-            raise HandshakeRefused(Drop.MALFORMED, "the secret has another length")
+            raise Refused(Drop.MALFORMED, "the secret has another length")
+        transcript.update(body[offsets[5] : offsets[6]])
         keys = SessionSecrets(shared, transcript.digest(), self.hello.mode)
-        if not hmac.compare_digest(mac, finished(keys.server_finished, transcript.digest())):
-            raise HandshakeRefused(Drop.SIGNATURE, "the offer does not hold")
-        transcript.update(body[offsets[7] :])
-        return Agreed(peer, keys, server_cid, own + finished(keys.client_finished, transcript.digest()))
+        if not hmac.compare_digest(mac, finished(keys.finished, transcript.digest())):
+            raise Refused(Drop.SIGNATURE, "the offer does not hold")
+        return Agreed(peer, keys, server_cid)
 
 
-class ServerHandshake:
-    """A server's side, made from a whole PROOF: `offer` is what it says, `confirm` judges the FINISHED."""
-
-    __slots__ = ("_exchange", "_finished", "offer", "peer", "secrets")
-
-    def __init__(
-        self, hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, server_cid: bytes,
-        randomness: Randomness, at: datetime,
-    ) -> None:  # fmt: skip
-        """Raise HandshakeRefused unless certificates and signature hold. The cookie was checked before."""
-        exchange = hello.mode is Mode.EXCHANGE
-        lengths = (None, None, POINT_SIZE if exchange else 0, None)
-        (signing, encryption, point, signature), offsets = _parse(body, lengths)
-        try:
-            self.peer = trust.check(signing, encryption, role=Role.ROBOT, at=at)
-        except ids.UntrustedCertificate as error:
-            hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
-            hint = hints.get(type(error), Reason.CERTIFICATE)
-            raise HandshakeRefused(Drop.CERTIFICATE, str(error), hint) from error
-        transcript = _transcript(hello, cookie)
-        transcript.update(body[: offsets[3]])
-        self._exchange: sm2.KeyExchange | None = None
-        try:
-            signer = self.peer.signing_certificate.public_key
-            ids.verify(signer, "handshake", b"client" + transcript.digest(), signature)
-            transcript.update(body[offsets[3] :])
-            if exchange:
-                self._exchange = _exchange(identity, self.peer, randomness.private_key(), initiator=False)
-                shared, confirmation = self._exchange.agree(point, SHARED_SIZE, unconfirmed=True)
-                material = self._exchange.ephemeral
-            else:
-                shared, confirmation = randomness.bytes(SHARED_SIZE), b""
-                material = self.peer.encryption_certificate.public_key.encrypt(shared)
-        except SMCryptoError as error:
-            raise HandshakeRefused(Drop.SIGNATURE, "the proof does not hold") from error
-        mine = (identity.signing_certificate.to_der(), identity.encryption_certificate.to_der())
-        unsigned = wire.fields([randomness.bytes(wire.NONCE_SIZE), server_cid, *mine, material])
-        transcript.update(unsigned)
-        signature = ids.sign(identity.signing_key, "handshake", b"server" + transcript.digest())
-        signed = wire.fields([signature, confirmation])
-        transcript.update(signed)
-        self.secrets = SessionSecrets(shared, transcript.digest(), hello.mode)
-        last = wire.fields([finished(self.secrets.server_finished, transcript.digest())])
-        transcript.update(last)
-        self._finished = finished(self.secrets.client_finished, transcript.digest())
-        self.offer = unsigned + signed + last
-
-    def confirm(self, finished: bytes) -> None:
-        """Return if the client's FINISHED, S_A | finished, holds, else HandshakeRefused."""
-        confirmation, mac = finished[:CONFIRMATION_SIZE], finished[CONFIRMATION_SIZE:]
-        holds = hmac.compare_digest(mac, self._finished)
-        try:
-            if self._exchange is not None:
-                self._exchange.confirm(confirmation)
-            else:
-                holds = holds and confirmation == NO_CONFIRMATION
-        except SMCryptoError:
-            holds = False
-        if not holds:
-            raise HandshakeRefused(Drop.SIGNATURE, "the client's confirmation does not hold")
+def answer_proof(
+    hello: Hello, cookie: bytes, body: bytes, *, identity: Identity, trust: Trust, server_cid: bytes,
+    randomness: Randomness, at: datetime,
+) -> Agreed:  # fmt: skip
+    """A server's side, from a whole PROOF. Refused unless its certificates and signature hold; the cookie was
+    checked before. The session stands when a packet of the client's opens."""
+    exchange = hello.mode is Mode.EXCHANGE
+    (signing, encryption, point, signature), offsets = _parse(body, (None, None, POINT_SIZE if exchange else 0, None))
+    try:
+        peer = trust.check(signing, encryption, role=Role.ROBOT, at=at)
+    except ids.UntrustedCertificate as error:
+        hints = {ids.ExpiredCertificate: Reason.EXPIRED, ids.NotAllowed: Reason.NOT_ALLOWED}
+        raise Refused(Drop.CERTIFICATE, str(error), hints.get(type(error), Reason.CERTIFICATE)) from error
+    transcript = _transcript(hello, cookie)
+    transcript.update(body[: offsets[3]])
+    try:
+        ids.verify(peer.signing_certificate.public_key, "handshake", b"client" + transcript.digest(), signature)
+        if exchange:
+            run = _exchange(identity, peer, randomness.private_key(), initiator=False)
+            shared, _ = run.agree(point, SHARED_SIZE, unconfirmed=True)
+            material = run.ephemeral
+        else:
+            shared = randomness.bytes(SHARED_SIZE)
+            material = peer.encryption_certificate.public_key.encrypt(shared)
+    except SMCryptoError as error:
+        raise Refused(Drop.SIGNATURE, "the proof does not hold") from error
+    transcript.update(body[offsets[3] : offsets[4]])
+    mine = (identity.signing_certificate.to_der(), identity.encryption_certificate.to_der())
+    unsigned = wire.fields([randomness.bytes(wire.NONCE_SIZE), server_cid, *mine, material])
+    transcript.update(unsigned)
+    signed = wire.fields([ids.sign(identity.signing_key, "handshake", b"server" + transcript.digest())])
+    transcript.update(signed)
+    keys = SessionSecrets(shared, transcript.digest(), hello.mode)
+    return Agreed(peer, keys, unsigned + signed + wire.fields([finished(keys.finished, transcript.digest())]))

@@ -1,11 +1,10 @@
 """Keys of a session, sealed packets, and the replay window.
 
-Key schedule, HKDF with SM3 (RFC 5869). K is the handshake's shared secret, H the hash of its whole transcript,
-`mode` the mode's name:
+Key schedule, HKDF with SM3 (RFC 5869). K is the handshake's shared secret, H its transcript hash H3, `mode` the
+mode's name:
 
-    client | server | client-finished | server-finished (32 each)
-        = HKDF(K, salt = H, info = "rosbridge-eth/2 session " | mode)
-    key (16) | IV (12) = HKDF(client or server, info = "rosbridge-eth/2 packets")
+    client | server | finished (32 each) = HKDF(K, salt = H, info = "rosbridge-eth/3 session " | mode)
+    key (16) | IV (12) = HKDF(client or server, info = "rosbridge-eth/3 packets")
 
 Packets: SM4-GCM (RFC 8998), nonce = IV xor packet number, the header as associated data. Numbers count from 0 in
 each direction and are never used twice; a session ends long before its keys are used up, so there is no key update.
@@ -15,25 +14,27 @@ from __future__ import annotations
 
 import hmac
 
-from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, Kind, Mode
-from smcrypto import kdf, sm3, sm4
+from rosbridge_eth.channel.events import Drop, Refused
+from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, DATA_OVERHEAD, Kind, Malformed, Mode
+from smcrypto import InvalidTag, kdf, sm3, sm4
+
+SESSION_PACKETS = 1 << 20
+"""A session ends when so many packets were sent in a direction."""
 
 
 class SessionSecrets:
-    """The four secrets of a session. No repr shows them."""
+    """The three secrets of a session. No repr shows them."""
 
-    __slots__ = ("client", "client_finished", "server", "server_finished")
+    __slots__ = ("client", "finished", "server")
 
     def __init__(self, shared: bytes, transcript: bytes, mode: Mode) -> None:
-        info = b"rosbridge-eth/2 session " + mode.name.lower().encode("ascii")
-        derived = kdf.hkdf(shared, 128, salt=transcript, info=info)
-        self.client, self.server, self.client_finished, self.server_finished = (
-            derived[i : i + 32] for i in range(0, 128, 32)
-        )
+        info = b"rosbridge-eth/3 session " + mode.name.lower().encode("ascii")
+        derived = kdf.hkdf(shared, 96, salt=transcript, info=info)
+        self.client, self.server, self.finished = derived[:32], derived[32:64], derived[64:]
 
 
 def finished(secret: bytes, transcript: bytes) -> bytes:
-    """The confirmation of a whole handshake: HMAC-SM3 of its transcript hash, 32 bytes."""
+    """The server's confirmation of a handshake: HMAC-SM3 of its transcript hash, 32 bytes."""
     return hmac.new(secret, transcript, sm3.SM3).digest()
 
 
@@ -43,19 +44,27 @@ class Direction:
     __slots__ = ("_aead", "_iv")
 
     def __init__(self, secret: bytes) -> None:
-        derived = kdf.hkdf(secret, 28, info=b"rosbridge-eth/2 packets")
+        derived = kdf.hkdf(secret, 28, info=b"rosbridge-eth/3 packets")
         self._aead = sm4.SM4GCM(derived[:16])
         self._iv = int.from_bytes(derived[16:], "big")
 
-    def seal(self, cid: bytes, number: int, frames: bytes) -> bytes:
-        """The datagram that carries `frames`: header, ciphertext, tag."""
+    def seal(self, cid: bytes, number: int, frame: bytes) -> bytes:
+        """The datagram that carries `frame`: header, ciphertext, tag."""
         header = b"%c%b%b" % (Kind.DATA, cid, number.to_bytes(4, "big"))
-        return header + self._aead.encrypt((self._iv ^ number).to_bytes(12, "big"), frames, header)
+        return header + self._aead.encrypt((self._iv ^ number).to_bytes(12, "big"), frame, header)
 
-    def open(self, datagram: bytes, number: int) -> bytes:
-        """The frames of a datagram whose packet number is `number`, or smcrypto.InvalidTag."""
+    def open(self, datagram: bytes, replay: ReplayWindow) -> tuple[int, bytes]:
+        """Number and frame of a datagram, which `replay` has not seen; else Refused or Malformed."""
+        if len(datagram) <= DATA_OVERHEAD:
+            raise Malformed("a packet without a frame")
+        number = int.from_bytes(datagram[9:DATA_HEADER_SIZE], "big")
+        if replay.seen(number):
+            raise Refused(Drop.REPLAYED)
         nonce = (self._iv ^ number).to_bytes(12, "big")
-        return self._aead.decrypt(nonce, datagram[DATA_HEADER_SIZE:], datagram[:DATA_HEADER_SIZE])
+        try:
+            return number, self._aead.decrypt(nonce, datagram[DATA_HEADER_SIZE:], datagram[:DATA_HEADER_SIZE])
+        except InvalidTag:
+            raise Refused(Drop.TAG) from None
 
 
 class ReplayWindow:

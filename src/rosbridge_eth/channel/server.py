@@ -1,13 +1,12 @@
-"""A server of the channel: one process's connections. Sans-IO.
+"""A server of the channel: the sessions of one process. Sans-IO.
 
-What a stranger can cost: a HELLO, one keyed hash and a COOKIE of 51 bytes for 1,200; a PROOF piece with a good
-cookie, one of `max_half_open` places; a whole PROOF, signatures, within `source_rate` and `handshake_share`. DATA of
-unknown connections costs a look-up, and is not answered.
+What a stranger can cost: a HELLO, one keyed hash and a COOKIE of 51 bytes for 1,200; a piece of a PROOF with a good
+cookie, one of `max_half_open` places, from which the oldest goes; a whole PROOF, signatures, within `handshake_share`.
+DATA of unknown sessions costs a look-up, and is not answered. To no address go more bytes than came from it.
 """
 
 from __future__ import annotations
 
-import heapq
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
@@ -15,73 +14,101 @@ from datetime import datetime
 from hashlib import blake2s
 
 from rosbridge_eth.channel import events, wire
-from rosbridge_eth.channel.admission import Address, Cookies, Sources, TokenBucket
-from rosbridge_eth.channel.client import ACCEPTED_SIZE, utc_now
-from rosbridge_eth.channel.events import Drop, End, Event, ServerConfig
-from rosbridge_eth.channel.handshake import HandshakeRefused, Randomness, ServerHandshake
-from rosbridge_eth.channel.session import MAX_MESSAGE, NEVER, Early, Session
-from rosbridge_eth.channel.wire import Assembly, Hello, Kind, Malformed, Reason
+from rosbridge_eth.channel.admission import Address, Cookies, TokenBucket
+from rosbridge_eth.channel.client import utc_now
+from rosbridge_eth.channel.events import Drop, End, Event, Refused, ServerConfig, close_frame, parse_close
+from rosbridge_eth.channel.handshake import Agreed, Randomness, answer_proof
+from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
+from rosbridge_eth.channel.transfer import ACK_DELAY, ACK_EVERY, NEVER, Early, Receiving
+from rosbridge_eth.channel.wire import Answer, Assembly, Frame, Hello, Kind, Malformed, Reason
 from rosbridge_eth.identity import Identity, Trust
 
-COOKIE_LIFETIME = 20.0  # s
-HALF_OPEN_TIMEOUT = 10.0
+HANDSHAKE_LIFETIME = 20.0
+"""s that a cookie holds, and that pieces of a PROOF, an OFFER, and a session without a packet are kept."""
 IDLE_TIMEOUT = 30.0
 """s; a session without an authenticated packet for so long has ended."""
-OFFER_INTERVAL = 0.04  # s: an OFFER is repeated no faster, however often its PROOF comes
-AMPLIFICATION = 3  # RFC 9000, 8: bytes sent to an address that is not proven, per byte received from it
 SHARE_BURST = 0.25  # s of handshake work that may come at once
-PATIENCE = 5.0  # s in line, after which a client is about to begin anew: to answer it would be work for nothing
 SWEEP = 0.5  # s between two looks for what is over: half-open, silent and expired
-MAX_SOURCES = 4096
 
 
 def cookie_key(identity: Identity) -> bytes:
-    """A cookie key for `Server` that all processes of a server, and its next start, derive alike."""
-    return blake2s(identity.signing_key.to_bytes(), person=b"rbe-key2").digest()
+    """A cookie key for `Server` that a server's next start derives alike."""
+    return blake2s(identity.signing_key.to_bytes(), person=b"rbe-key3").digest()
 
 
-class _HalfOpen:
-    """A handshake with a good cookie: pieces of its PROOF; the whole of it, in line; then an OFFER and a connection."""
+class _Proof:
+    """A PROOF of which pieces are missing, or that waits for time. size: bytes of its datagrams that came."""
 
-    __slots__ = (
-        "assembly", "began", "confirm", "connection", "cookie", "key", "offer", "offered_at", "offers", "proof",
-    )  # fmt: skip
-    offer: list[bytes]
-    confirm: Callable[[bytes], None]
+    __slots__ = ("assembly", "began", "size")
 
-    def __init__(self, key: tuple[Address, Hello], cookie: bytes, now: float) -> None:
-        self.key, self.cookie = key, cookie
-        self.began = now
-        self.assembly = Assembly()
-        self.proof: bytes | None = None
-        self.connection: _Connection | None = None
-        self.offers, self.offered_at = 0, now
+    def __init__(self, now: float) -> None:
+        self.began, self.assembly, self.size = now, Assembly(), 0
 
 
-class _Connection:
-    """A session, and where its client is: the address that sent the newest authentic packet (WireGuard's rule).
+class _Session:
+    """One client, at the address that sent the newest authentic packet (WireGuard's rule).
 
-    A new address is proven when a packet first sent there, `first_there` or a later one, is acknowledged; until then
-    only `allowance` bytes more go there. half_open: until the client's FINISHED holds.
+    credit: how many bytes more came from there than went there.
     """
 
-    __slots__ = ("address", "allowance", "cid", "first_there", "half_open", "scheduled", "session")
+    __slots__ = (
+        "_next_offer", "address", "began", "cid", "client_cid", "credit", "due", "heard", "number",
+        "offer", "opens", "peer", "pending", "receiving", "replay", "seals", "state", "told",
+    )  # fmt: skip
 
-    def __init__(self, cid: bytes, half_open: _HalfOpen, session: Session) -> None:
-        self.cid = cid
-        self.half_open: _HalfOpen | None = half_open
-        self.session = session
-        self.address = half_open.key[0]  # proven by the cookie
-        self.allowance = NEVER
-        self.first_there = 0
-        self.scheduled = NEVER
+    def __init__(
+        self, agreed: Agreed, cid: bytes, key: tuple[Address, Hello], credit: int, now: float, early: Early
+    ) -> None:
+        self.peer, self.cid, self.client_cid = agreed.peer, cid, key[1].client_cid
+        self.address, self.credit = key[0], credit
+        self.offer, self._next_offer = key[1].in_pieces(Kind.OFFER, b"", agreed.told), 0
+        self.seals, self.opens = Direction(agreed.secrets.server), Direction(agreed.secrets.client)
+        self.replay, self.receiving = ReplayWindow(), Receiving(early)
+        self.state = self.told = b""  # what the program says, and what of it went out last
+        self.number = 0  # of the next packet
+        self.began = self.heard = now
+        self.pending, self.due = 0, NEVER  # packets without an answer, and when they get one
+
+    def offers(self) -> list[bytes]:
+        """The next datagrams of the OFFER, each once at most, as far as the credit goes."""
+        out = list[bytes]()
+        for _ in self.offer:
+            datagram = self.offer[self._next_offer]
+            if len(datagram) > self.credit:
+                break
+            self.credit -= len(datagram)
+            self._next_offer = (self._next_offer + 1) % len(self.offer)
+            out.append(datagram)
+        return out
+
+    def seal(self, frame: bytes) -> bytes | None:
+        """A packet to the client, or None where its address has no credit for it."""
+        if len(frame) + wire.DATA_OVERHEAD > self.credit:
+            return None
+        self.credit -= len(frame) + wire.DATA_OVERHEAD
+        self.number += 1
+        return self.seals.seal(self.client_cid, self.number - 1, frame)
+
+    def answer(self, time_ms: int) -> bytes | None:
+        """What came, and the state; without the state, or nothing, where there is no credit for more."""
+        if self.replay.highest < 0:
+            return None
+        answer = Answer(self.replay.highest, self.receiving.next, time_ms, self.replay.bits, self.state)
+        datagram = self.seal(answer.to_bytes())
+        if datagram is not None:
+            self.told = self.state
+        else:
+            datagram = self.seal(answer._replace(data=b"").to_bytes())
+        if datagram is not None:
+            self.pending, self.due = 0, NEVER
+        return datagram
 
 
 class Server:
     """In a loop: `receive_datagram`, `handle_timer`, `next_event`, `datagrams_to_send`. See Client for clocks.
 
-    cookie_key: 32 secret bytes, the same for all processes that share the port and across restarts
-    (`cookie_key(identity)`). stopwatch: measures what a handshake costs. Not thread-safe.
+    cookie_key: 32 secret bytes, the same across restarts (`cookie_key(identity)`). stopwatch: measures what a handshake
+    costs. Not thread-safe.
     """
 
     def __init__(
@@ -92,20 +119,19 @@ class Server:
         self.config = config
         self._identity, self._trust = identity, trust
         self._wall, self._randomness, self._stopwatch = wall, randomness or Randomness(), stopwatch
-        self._cookies = Cookies(cookie_key, COOKIE_LIFETIME)
-        self._sources = Sources(config.source_rate, config.source_burst, MAX_SOURCES)
+        self._cookies = Cookies(cookie_key, HANDSHAKE_LIFETIME)
         self._share = TokenBucket(config.handshake_share, SHARE_BURST, now)
         self._early = Early(config.max_early)
         self._counts: Counter[str] = Counter()
         self._events: deque[Event] = deque()
         self._outbox: list[tuple[bytes, Address]] = []
-        self._half_open: dict[tuple[Address, Hello], _HalfOpen] = {}  # in the order of their beginning
-        self._line: deque[_HalfOpen] = deque()
-        self._finished: OrderedDict[bytes, float] = OrderedDict()  # client nonces, until their cookies expire
-        self._connections: dict[bytes, _Connection] = {}
-        self._by_name: dict[str, _Connection] = {}
-        self._touched: dict[bytes, _Connection] = {}
-        self._timers: list[tuple[float, bytes]] = []
+        # In the order of their beginning; one that was answered is kept, so that it is examined once.
+        self._proofs: OrderedDict[tuple[Address, Hello], _Proof] = OrderedDict()
+        self._offered: OrderedDict[tuple[Address, Hello], _Session] = OrderedDict()
+        self._sessions: dict[bytes, _Session] = {}
+        self._by_name: dict[str, _Session] = {}  # those that stand: a packet of the client's has opened
+        self._touched: dict[bytes, _Session] = {}  # to be answered now
+        self._due: deque[tuple[float, _Session]] = deque()  # to be answered later, in order
         self._sweep_at = now
 
     # What the program calls
@@ -114,49 +140,40 @@ class Server:
         """The oldest event that was not fetched, or None. Fetch them all in each turn: nothing bounds them."""
         return self._events.popleft() if self._events else None
 
-    def _standing(self, connection: bytes) -> _Connection | None:
-        found = self._connections.get(connection)
-        return found if found is not None and found.half_open is None else None
-
-    def writable(self, connection: bytes, size: int = MAX_MESSAGE) -> bool:
-        """Whether `send` takes a message of `size` bytes at this moment."""
-        found = self._standing(connection)
-        return found is not None and found.session.has_room(size)
-
-    def send(self, connection: bytes, payload: bytes) -> None:
-        """Send a message of 0 to MAX_MESSAGE bytes. NotConnected if the session is gone, Full if `writable` says no."""
-        found = self._standing(connection)
-        if found is None:
-            raise events.NotConnected("the session is gone")
-        found.session.send(payload)
-        self._touched[connection] = found
-        self._counts["messages_sent"] += 1
+    def set_state(self, connection: bytes, state: bytes) -> None:
+        """What the client is to know from now on: 1 to MAX_STATE bytes. Nothing happens if the session is gone."""
+        if not 1 <= len(state) <= wire.MAX_STATE:
+            raise ValueError(f"a state has 1 to {wire.MAX_STATE} bytes, not {len(state)}")
+        session = self._sessions.get(connection)
+        if session is not None and session.state != state:
+            session.state = state
+            self._touched[connection] = session
 
     def close_connection(self, connection: bytes, reason: End = End.CLOSED) -> None:
         """End one session and tell the client; nothing happens if it is gone."""
-        found = self._connections.get(connection)
-        if found is not None:
-            self._remove(found, reason)
+        if (session := self._sessions.get(connection)) is not None:
+            self._remove(session, reason)
 
     def close_peer(self, name: str, reason: End = End.REVOKED) -> None:
         """End the session of a robot, if it has one here, and those it is about to have."""
-        for connection in list(self._connections.values()):
-            if connection.session.peer.name == name:
-                self._remove(connection, reason)
+        for session in list(self._sessions.values()):
+            if session.peer.name == name:
+                self._remove(session, reason)
 
     def close(self) -> None:
         """End every session and tell the clients."""
-        for connection in list(self._connections.values()):
-            self._remove(connection, End.CLOSED)
+        for session in list(self._sessions.values()):
+            self._remove(session, End.CLOSED)
 
     def address_of(self, connection: bytes) -> Address | None:
-        """Where the client of a connection is; None if the connection is gone."""
-        found = self._connections.get(connection)
-        return None if found is None else found.address
+        """Where the client of a session is; None if the session is gone."""
+        session = self._sessions.get(connection)
+        return None if session is None else session.address
 
     def statistics(self) -> Counter[str]:
         """What was counted since this server was made, each Drop among it, and what is there at this moment."""
-        there = {"connections": len(self._by_name), "half_open": len(self._half_open), "early": self._early.kept}
+        half_open = len(self._proofs) + len(self._sessions) - len(self._by_name)
+        there = {"connections": len(self._by_name), "half_open": half_open, "early": self._early.kept}
         return Counter({**self._counts, **there})
 
     # What the network and the clock call
@@ -172,25 +189,19 @@ class Server:
                 self._on_handshake(data, address, now)
         except Malformed:
             self._counts[Drop.MALFORMED] += 1
-        except HandshakeRefused as refused:
+        except Refused as refused:
             self._counts[refused.drop] += 1
 
     def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
         """What may go to the network now."""
         touched, self._touched = self._touched, {}
-        for connection in touched.values():
-            session = connection.session
-            while connection.allowance >= wire.DATAGRAM_SIZE and (datagram := session.next_datagram(now)) is not None:
-                connection.allowance -= len(datagram)
-                self._outbox.append((datagram, connection.address))
-            if session.ended is not None:
-                self._remove(connection, session.ended)
-                continue
-            # Where no more may go to its address, it is the client's turn.
-            when = session.timer(now) if connection.allowance >= wire.DATAGRAM_SIZE else NEVER
-            if when < connection.scheduled:
-                connection.scheduled = when
-                heapq.heappush(self._timers, (when, connection.cid))
+        if touched:
+            time_ms = int(self._wall().timestamp() * 1000)
+            for session in touched.values():
+                if (datagram := session.answer(time_ms)) is not None:
+                    self._outbox.append((datagram, session.address))
+                if session.number >= SESSION_PACKETS:
+                    self._remove(session, End.EXPIRED)
         out, self._outbox = self._outbox, []
         self._counts["datagrams_sent"] += len(out)
         self._counts["bytes_sent"] += sum(len(datagram) for datagram, _ in out)
@@ -198,211 +209,165 @@ class Server:
 
     def next_timer(self) -> float | None:
         """When to call `handle_timer`, on the clock of `now`; None for never."""
-        when = self._timers[0][0] if self._timers else NEVER
-        if self._half_open or self._connections:
-            when = min(when, self._sweep_at)
-        if self._line:
-            when = min(when, self._share.ready_at())
-        return None if when == NEVER else when
+        while self._due and self._due[0][0] != self._due[0][1].due:  # it was answered before
+            self._due.popleft()
+        if self._due:
+            return min(self._due[0][0], self._sweep_at)
+        return self._sweep_at if self._proofs or self._offered or self._sessions else None
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`; harmless if nothing is."""
         if now >= self._sweep_at:
             self._sweep(now)
-        self._serve_line(now)
-        while self._timers and self._timers[0][0] <= now:
-            when, cid = heapq.heappop(self._timers)
-            connection = self._connections.get(cid)
-            if connection is not None and connection.scheduled == when:
-                connection.scheduled = NEVER
-                connection.session.handle_timer(now)
-                self._touched[cid] = connection
+        while self._due and self._due[0][0] <= now:
+            due, session = self._due.popleft()
+            if session.due == due:
+                self._touched[session.cid] = session
 
     def _sweep(self, now: float) -> None:
         self._sweep_at = now + SWEEP
-        for half_open in list(self._half_open.values()):
-            if now < half_open.began + HALF_OPEN_TIMEOUT:
-                break
-            if half_open.connection is not None:
-                self._remove(half_open.connection, End.SILENT)
-            elif half_open.proof is not None:
-                self._give_up(half_open)
-            else:
-                del self._half_open[half_open.key]
-        while self._finished and now > next(iter(self._finished.values())) + COOKIE_LIFETIME:
-            self._finished.popitem(last=False)
-        for connection in list(self._connections.values()):
-            if connection.half_open is None and now >= connection.session.last_received + IDLE_TIMEOUT:
-                self._remove(connection, End.SILENT)
-            elif now >= connection.session.expires:
-                self._remove(connection, End.EXPIRED)
+        while self._proofs and now >= next(iter(self._proofs.values())).began + HANDSHAKE_LIFETIME:
+            self._proofs.popitem(last=False)
+        while self._offered and now >= next(iter(self._offered.values())).began + HANDSHAKE_LIFETIME:
+            self._offered.popitem(last=False)
+        for session in list(self._sessions.values()):
+            stands = self._by_name.get(session.peer.name) is session
+            if now >= session.heard + (IDLE_TIMEOUT if stands else HANDSHAKE_LIFETIME):
+                self._remove(session, End.SILENT)
+            elif now >= session.began + self.config.session_seconds:
+                self._remove(session, End.EXPIRED)
 
     # Handshake
 
     def _on_handshake(self, data: bytes, address: Address, now: float) -> None:
         hello, rest = Hello.parse(data)
         if hello.mode not in self.config.modes:
-            raise HandshakeRefused(Drop.MODE)
+            raise Refused(Drop.MODE)
         if data[0] == Kind.HELLO and rest == wire.HELLO_PADDING:
             self._counts["cookies"] += 1
             self._outbox.append((hello.datagram(Kind.COOKIE, self._cookies.make(address, hello, now)), address))
         elif data[0] == Kind.PROOF:
-            cookie, piece = rest[:wire.COOKIE_SIZE], wire.parse_piece(rest[wire.COOKIE_SIZE:])
-            self._on_proof((address, hello), cookie, piece, now)
+            cookie, piece = rest[: wire.COOKIE_SIZE], wire.parse_piece(rest[wire.COOKIE_SIZE :])
+            if not self._cookies.holds(cookie, address, hello, now):
+                raise Refused(Drop.COOKIE)
+            self._on_proof((address, hello), cookie, piece, len(data), now)
         else:
             raise Malformed("not for a server")
 
-    def _on_proof(self, key: tuple[Address, Hello], cookie: bytes, piece: wire.Piece, now: float) -> None:
-        address, hello = key
-        if not self._cookies.holds(cookie, address, hello, now):
-            raise HandshakeRefused(Drop.COOKIE)
-        # From here on the sender has shown that it receives at its address.
-        if hello.nonce in self._finished:
-            raise HandshakeRefused(Drop.REPLAYED_HANDSHAKE)
-        half_open = self._half_open.get(key)
-        if half_open is None:
-            if len(self._half_open) >= self.config.max_half_open:
-                raise HandshakeRefused(Drop.HALF_OPEN)
-            if not self._sources.take(address, now):
-                raise HandshakeRefused(Drop.SOURCE_LIMIT)
-            half_open = self._half_open[key] = _HalfOpen(key, cookie, now)
+    def _on_proof(self, key: tuple[Address, Hello], cookie: bytes, piece: wire.Piece, size: int, now: float) -> None:
+        """A PROOF from an address that has shown that it receives there."""
+        if (session := self._offered.get(key)) is not None:
+            if session.address == key[0]:
+                session.credit += size
+                self._outbox += [(datagram, key[0]) for datagram in session.offers()]
+            return
+        if key not in self._proofs:
+            self._proofs[key] = _Proof(now)
             self._counts["handshakes_begun"] += 1
-        if half_open.connection is not None:
-            if now - half_open.offered_at >= OFFER_INTERVAL:
-                self._offer(half_open, now)
-        elif half_open.proof is None and (proof := half_open.assembly.add(piece)) is not None:
-            # The cookie is what the body's signature covers, should the client have been given two.
-            half_open.cookie, half_open.proof = cookie, proof
-            self._line.append(half_open)
-            self._serve_line(now)
-
-    def _serve_line(self, now: float) -> None:
-        """Answer whole PROOFs, in order, as long as handshakes have time.
-
-        Many robots begin at once, after a power cut: in line they are served as fast as the share allows, turned
-        away they would come back later and later. The line is no longer than max_half_open.
-        """
-        while self._line and self._share.available(now) > 0:
-            half_open = self._line.popleft()
-            if self._half_open.get(half_open.key) is not half_open:
-                continue
-            if now - half_open.began > PATIENCE:
-                self._give_up(half_open)
-                continue
-            began = self._stopwatch()
-            try:
-                self._answer_proof(half_open, now)
-            except HandshakeRefused as refused:
-                self._counts[refused.drop] += 1
-                address, hello = half_open.key
-                del self._half_open[half_open.key]
-                if refused.hint is Reason.FULL:  # no failure of the source's
-                    self._sources.give_back(address)
-                if refused.hint is not None:
-                    self._outbox.append((hello.datagram(Kind.REFUSAL, bytes((refused.hint,))), address))
+            if len(self._proofs) > self.config.max_half_open:
+                self._proofs.popitem(last=False)
+                self._counts[Drop.HALF_OPEN] += 1
+        proof = self._proofs[key]
+        proof.size += size
+        body = proof.assembly.add(piece)
+        if body is None:
+            return
+        if len(self._sessions) - len(self._by_name) >= self.config.max_half_open:
+            raise Refused(Drop.HALF_OPEN)
+        if self._share.available(now) <= 0:
+            raise Refused(Drop.BUSY)  # it is examined when it comes again
+        del self._proofs[key]
+        began = self._stopwatch()
+        try:
+            self._offer(key, cookie, body, proof.size, now)
+        except Refused as refused:
+            if refused.hint is not None:
+                self._outbox.append((key[1].datagram(Kind.REFUSAL, bytes((refused.hint,))), key[0]))
+            raise
+        finally:
             self._share.charge(self._stopwatch() - began)
 
-    def _give_up(self, half_open: _HalfOpen) -> None:
-        """Its turn did not come in time. That is no failure of the source's."""
-        self._counts[Drop.BUSY] += 1
-        self._sources.give_back(half_open.key[0])
-        del self._half_open[half_open.key]
-
-    def _answer_proof(self, half_open: _HalfOpen, now: float) -> None:
-        if len(self._connections) >= self.config.max_connections:
-            raise HandshakeRefused(Drop.CONNECTIONS, "no room for another connection", Reason.FULL)
-        hello = half_open.key[1]
-        cid = bytes((self.config.worker,)) + self._randomness.bytes(wire.CID_SIZE - 1)
-        handshake = ServerHandshake(
-            hello, half_open.cookie, half_open.proof or b"", identity=self._identity, trust=self._trust,
-            server_cid=cid, randomness=self._randomness, at=self._wall(),
+    def _offer(self, key: tuple[Address, Hello], cookie: bytes, body: bytes, credit: int, now: float) -> None:
+        if len(self._sessions) >= self.config.max_connections:
+            raise Refused(Drop.CONNECTIONS, "no room for another connection", Reason.FULL)
+        cid = self._randomness.bytes(wire.CID_SIZE)
+        agreed = answer_proof(
+            key[1], cookie, body, identity=self._identity, trust=self._trust, server_cid=cid,
+            randomness=self._randomness, at=self._wall(),
         )  # fmt: skip
-        session = Session(
-            handshake.peer, hello.client_cid, handshake.secrets.server, handshake.secrets.client, now=now, rtt=None,
-            expires=now + self.config.session_seconds, early=self._early, counts=self._counts,
-        )  # fmt: skip
-        half_open.offer, half_open.confirm = hello.in_pieces(Kind.OFFER, b"", handshake.offer), handshake.confirm
-        half_open.connection = self._connections[cid] = _Connection(cid, half_open, session)
-        self._offer(half_open, now)
-
-    def _offer(self, half_open: _HalfOpen, now: float) -> None:
-        half_open.offers += 1
-        half_open.offered_at = now
-        self._outbox += [(datagram, half_open.key[0]) for datagram in half_open.offer]
+        session = self._sessions[cid] = self._offered[key] = _Session(agreed, cid, key, credit, now, self._early)
+        self._outbox += [(datagram, key[0]) for datagram in session.offers()]
 
     # Sessions
 
     def _on_data(self, data: bytes, address: Address, now: float) -> None:
-        if len(data) <= wire.DATA_OVERHEAD:
-            raise Malformed("a packet without a frame")
-        connection = self._connections.get(data[1:9])
-        if connection is None:
-            self._counts[Drop.UNKNOWN_CONNECTION] += 1
-            return
-        session = connection.session
-        if not session.receive(data, now):
-            return
-        if connection.half_open is not None and session.messages:
-            self._establish(connection, connection.half_open, session.messages.pop(0), now)
-        if connection.half_open is None:
-            for payload in session.messages:
-                self._counts["messages_received"] += 1
-                self._events.append(events.Message(connection.cid, payload, session.peer))
-            session.messages.clear()
-            self._look_at_address(connection, len(data), address, now)
-            self._touched[connection.cid] = connection
-        if session.ended is not None:
-            self._remove(connection, session.ended)
-
-    def _establish(self, connection: _Connection, half_open: _HalfOpen, finished: bytes, now: float) -> None:
-        """If the client's FINISHED, its first message, holds. Only now is another session of this robot replaced."""
-        session = connection.session
-        try:
-            half_open.confirm(finished)
-        except HandshakeRefused as refused:
-            self._counts[refused.drop] += 1
-            session.end(End.PROTOCOL)
-            return
-        address, hello = half_open.key
-        del self._half_open[half_open.key]
-        connection.half_open = None
-        if half_open.offers == 1:
-            session.round_trip.update(now - half_open.offered_at)
-        self._sources.give_back(address)
-        self._finished[hello.nonce] = now
-        older = self._by_name.get(session.peer.name)
-        if older is not None:
-            self._remove(older, End.REPLACED)
-        self._by_name[session.peer.name] = connection
-        session.send(int(self._wall().timestamp() * 1000).to_bytes(ACCEPTED_SIZE, "big"))
-        self._counts["handshakes"] += 1
-        self._events.append(events.Connected(session.peer, connection.cid))
-
-    def _look_at_address(self, connection: _Connection, size: int, address: Address, now: float) -> None:
-        session = connection.session
-        if address != connection.address and session.newest:  # an older one came late, or was held back by somebody
-            connection.address, connection.allowance = address, 0
-            connection.first_there = session.next_number
-        if connection.allowance == NEVER:
-            return
-        if session.largest_acked >= connection.first_there:
-            connection.allowance = NEVER
+        session = self._sessions.get(data[1:9])
+        if session is None:
+            raise Refused(Drop.UNKNOWN_CONNECTION)
+        number, frame = session.opens.open(data, session.replay)
+        if self._by_name.get(session.peer.name) is not session:
+            self._stand(session)
+        session.heard = now
+        newest = number > session.replay.highest
+        if address != session.address and newest:  # an older one came late, or was held back by somebody
+            session.address, session.credit = address, 0
             self._counts["address_changes"] += 1
-        elif address == connection.address:
-            datagram = session.challenge(now)  # shorter than any packet that came
-            connection.allowance += AMPLIFICATION * size - len(datagram)
-            self._outbox.append((datagram, address))
+        if address == session.address:
+            session.credit += len(data)
+        try:
+            at_once = self._take(session, frame)
+        except Malformed:
+            self._remove(session, End.PROTOCOL)
+            return
+        if at_once is None:
+            return
+        gap = number != session.replay.highest + 1
+        session.replay.mark(number)
+        session.pending += 1
+        if number >= SESSION_PACKETS:
+            self._remove(session, End.EXPIRED)
+        elif at_once or gap or session.pending >= ACK_EVERY or session.told != session.state:
+            self._touched[session.cid] = session
+        elif session.due == NEVER:
+            session.due = now + ACK_DELAY
+            self._due.append((session.due, session))
 
-    def _remove(self, connection: _Connection, reason: End) -> None:
-        session, half_open = connection.session, connection.half_open
-        if half_open is not None:
-            del self._half_open[half_open.key]
-        else:
-            if reason is not End.CLOSED_BY_PEER and connection.allowance >= wire.DATA_OVERHEAD + 2:
-                self._outbox.append((session.close_datagram(reason), connection.address))
-            self._events.append(events.Disconnected(reason, connection.cid, session.peer))
-        session.release()
-        del self._connections[connection.cid]
-        self._touched.pop(connection.cid, None)
-        if self._by_name.get(session.peer.name) is connection:
+    def _stand(self, session: _Session) -> None:
+        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced."""
+        if (older := self._by_name.get(session.peer.name)) is not None:
+            self._remove(older, End.REPLACED)
+        self._by_name[session.peer.name] = session
+        self._counts["handshakes"] += 1
+        self._events.append(events.Connected(session.peer, session.cid))
+
+    def _take(self, session: _Session, frame: bytes) -> bool | None:
+        """Whether it asks for an answer at once; None where it was the last."""
+        kind, rest = frame[0], frame[1:]
+        if kind == Frame.PROBE and not any(rest):
+            return True
+        if (reason := parse_close(frame)) is not None:
+            self._remove(session, reason, told=True)
+            return None
+        if kind != Frame.SEGMENT or len(rest) <= 4:
+            raise Malformed(f"frame {kind} does not exist, or not with {len(rest)} bytes behind it")
+        receiving, index = session.receiving, int.from_bytes(rest[:4], "big")
+        if receiving.known(index):
+            self._counts["duplicates"] += 1
+        elif not receiving.take(index, rest[4:]):
+            raise Refused(Drop.FULL)  # not marked, so not acknowledged: it comes again when there may be room
+        self._counts["messages_received"] += len(receiving.messages)
+        self._events.extend(events.Message(session.cid, payload) for payload in receiving.messages)
+        receiving.messages.clear()
+        return False
+
+    def _remove(self, session: _Session, reason: End, *, told: bool = False) -> None:
+        """told: the client knows."""
+        if self._by_name.get(session.peer.name) is session:
             del self._by_name[session.peer.name]
+            if not told and (datagram := session.seal(close_frame(reason))) is not None:
+                self._outbox.append((datagram, session.address))
+            self._events.append(events.Disconnected(reason, session.cid, session.peer))
+        session.receiving.release()
+        session.due = NEVER
+        del self._sessions[session.cid]
+        self._touched.pop(session.cid, None)

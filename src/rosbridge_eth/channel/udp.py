@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.client import Client, State
+from rosbridge_eth.channel.client import Client
 from rosbridge_eth.channel.events import Event, Unresolved
 from rosbridge_eth.channel.server import Server
 from rosbridge_eth.errors import NetworkError
@@ -166,7 +166,7 @@ class ClientLoop(UdpLoop):
 
     def seek(self, now: float) -> None:
         """While there is no session: ask for the server's address, and connect to a new one. Call it in each turn."""
-        if self._client.state is State.CONNECTED:
+        if self._client.connected:
             self.resolved, self._asked = True, self._taken
             return
         if self._answer is not None and self._answer.done():

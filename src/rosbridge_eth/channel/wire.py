@@ -1,7 +1,7 @@
 """What stands in a datagram, byte for byte. Big-endian throughout; docs/channel.md has the figures.
 
 A datagram is one of five handshake kinds, which all begin alike, or DATA: 0x40, connection id (8), packet number (4),
-then SM4-GCM of frames, and its tag (16). The 13 bytes before are authenticated.
+then SM4-GCM of one frame, and its tag (16). The 13 bytes before are authenticated.
 
 Parsers here take bytes from anybody. They return values or raise Malformed; they never allocate more than they
 were given.
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-VERSION = 2
+VERSION = 3
 DATAGRAM_SIZE = 1200
 """Bytes of UDP payload that every path is taken to carry (RFC 9000, 14: the same figure, for the same reason)."""
 
@@ -69,7 +69,8 @@ class Hello(NamedTuple):
     """What every handshake datagram says behind its kind and version: mode (1), client's connection id (8), N (16).
 
     It names one attempt of one client. Behind it stands: in HELLO zeros up to 1,200 bytes; in COOKIE the cookie; in
-    PROOF the cookie and a piece; in OFFER a piece; in REFUSAL a reason (1).
+    PROOF the cookie and a piece, of which the last ends in zeros up to 1,200 bytes; in OFFER a piece; in REFUSAL a
+    reason (1).
     """
 
     mode: Mode
@@ -92,6 +93,8 @@ class Hello(NamedTuple):
     def in_pieces(self, kind: Kind, before: bytes, body: bytes) -> list[bytes]:
         """The datagrams of a PROOF or an OFFER: in each `before`, index, count, a piece of the body."""
         size = DATAGRAM_SIZE - HEAD_SIZE - len(before) - 2
+        if kind is Kind.PROOF:  # the answer is never longer than what asked for it
+            body += bytes(-len(body) % size)
         pieces = [body[start : start + size] for start in range(0, len(body), size)]
         if len(pieces) > MAX_PIECES:
             raise ValueError(f"a handshake message of {len(body)} bytes does not fit in {MAX_PIECES} datagrams")
@@ -118,7 +121,7 @@ class Assembly:
         self._count = 0
 
     def add(self, piece: Piece) -> bytes | None:
-        """The whole body once its last piece has come, else None.
+        """The whole body once all its pieces have come, else None.
 
         If the number of pieces changed: Malformed, and begun anew; one wrong piece must not keep the right ones out.
         """
@@ -130,9 +133,7 @@ class Assembly:
         self._pieces.setdefault(index, data)
         if len(self._pieces) < count:
             return None
-        body = b"".join(self._pieces[i] for i in range(count))
-        self._pieces = {}
-        return body
+        return b"".join(self._pieces[i] for i in range(count))
 
 
 def fields(parts: Sequence[bytes]) -> bytes:
@@ -141,7 +142,7 @@ def fields(parts: Sequence[bytes]) -> bytes:
 
 
 def parse_fields(body: bytes, count: int) -> tuple[list[bytes], list[int]]:
-    """Exactly `count` fields and nothing after them; and the offset in `body` at which each begins."""
+    """Exactly `count` fields, then nothing but zeros; and offsets in `body`: where each field begins, and the end."""
     parts: list[bytes] = []
     offsets: list[int] = []
     position = 0
@@ -153,55 +154,60 @@ def parse_fields(body: bytes, count: int) -> tuple[list[bytes], list[int]]:
         parts.append(body[start:stop])
         offsets.append(position)
         position = stop
-    if position != len(body):
+    if any(body[position:]):
         raise Malformed("a handshake message goes on after its last field")
-    return parts, offsets
+    return parts, [*offsets, position]
 
 
-# Frames inside DATA: an ACK or none, and then nothing, or one of the others
+# The frame inside DATA: one, to the end of the packet
 
 
 class Frame(IntEnum):
-    """First byte of a frame. PING: nothing. SEGMENT: index (4), data to the end of the packet. CLOSE: reason (1)."""
+    """First byte of a frame. Up: SEGMENT: index (4), data. PROBE: zeros. Down: ANSWER. Both: CLOSE: reason (1)."""
 
-    PING = 0x01
-    ACK = 0x02
-    SEGMENT = 0x03
+    SEGMENT = 0x01
+    PROBE = 0x02
+    ANSWER = 0x03
     CLOSE = 0x04
 
 
 SEGMENT_HEADER = struct.Struct(">BI")
 SEGMENT_SIZE = DATAGRAM_SIZE - DATA_OVERHEAD - SEGMENT_HEADER.size
-_ACK = struct.Struct(">BIIB")
+MAX_STATE = 600
+"""Bytes that a server's program may say to a robot."""
 ACK_BITS = 512
 _ACK_MASK = (1 << ACK_BITS) - 1
-MAX_ACK_SIZE = _ACK.size + ACK_BITS // 8
+_ANSWER = struct.Struct(">BIIQB")
+PROBE = bytes((Frame.PROBE,)).ljust(_ANSWER.size + ACK_BITS // 8 + MAX_STATE, b"\0")
+"""As long as the longest ANSWER."""
 
 
-class Ack(NamedTuple):
-    """ACK: largest packet number received (4), the segment that comes next in order (4), n (1), n bytes: bit i, from
-    the low end, is packet largest - i.
+class Answer(NamedTuple):
+    """ANSWER: largest packet number received (4), the segment that comes next in order (4), the server's clock in ms
+    since 1970 (8), n (1), n bytes: bit i, from the low end, is packet largest - i; then what the program says.
     """
 
     largest: int
     next_segment: int
+    time_ms: int
     bits: int
+    data: bytes
 
     def to_bytes(self) -> bytes:
         bits = self.bits & _ACK_MASK
         size = (bits.bit_length() + 7) // 8
-        return _ACK.pack(Frame.ACK, self.largest, self.next_segment, size) + bits.to_bytes(size, "big")
+        head = _ANSWER.pack(Frame.ANSWER, self.largest, self.next_segment, self.time_ms, size)
+        return head + bits.to_bytes(size, "big") + self.data
 
     @staticmethod
-    def parse(frames: bytes) -> tuple[Ack, bytes]:
-        """The ACK at the beginning of a packet, and what stands behind it."""
-        if len(frames) < _ACK.size:
-            raise Malformed("an ACK ends early")
-        _, largest, next_segment, size = _ACK.unpack_from(frames)
-        stop = _ACK.size + size
-        if stop > len(frames) or size > ACK_BITS // 8:
-            raise Malformed("an ACK ends early, or is too long")
-        bits = int.from_bytes(frames[_ACK.size : stop], "big")
+    def parse(frame: bytes) -> Answer:
+        if len(frame) < _ANSWER.size or frame[0] != Frame.ANSWER:
+            raise Malformed("a frame that does not exist or is not for a client, or an answer that ends early")
+        _, largest, next_segment, time_ms, size = _ANSWER.unpack_from(frame)
+        stop = _ANSWER.size + size
+        if stop > len(frame) or size > ACK_BITS // 8 or len(frame) - stop > MAX_STATE:
+            raise Malformed("an answer ends early, or is too long")
+        bits = int.from_bytes(frame[_ANSWER.size : stop], "big")
         if not bits & 1 or bits.bit_length() > largest + 1:
-            raise Malformed("an ACK without its largest packet, or of negative packet numbers")
-        return Ack(largest, next_segment, bits), frames[stop:]
+            raise Malformed("an answer without its largest packet, or of negative packet numbers")
+        return Answer(largest, next_segment, time_ms, bits, frame[stop:])

@@ -250,6 +250,7 @@ def verify(
     Exits with 9 where anything does not hold, with 7 where the node named does not answer.
     """
     from rosbridge_eth.reading import evidence as checking
+    from rosbridge_eth.reading import outputs
 
     data = read_given(file, checking.MAX_FILE + 1)
     given = checking.Evidence.read(data)
@@ -262,7 +263,7 @@ def verify(
         print_json(found.as_json())
     else:
         for record in found.records:
-            print(record.json_line(), end="")
+            print(outputs.json_line(record), end="")
     talk("What this proves:")
     for line in found.proves(asked):
         talk(f"- {line}")

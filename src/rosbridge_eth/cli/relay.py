@@ -1,20 +1,20 @@
 """A bad network on one machine: a UDP relay that loses, doubles and reorders what passes through it.
 
-For `demo --loss`, and for tests where the kernel's own (tc netem) is not
-permitted. One client at a time is told from the server by its address.
+For `demo --loss`, and for tests where the kernel's own (tc netem) is not permitted. One client at a time is told from
+the server by its address.
 """
 
 from __future__ import annotations
 
 import contextlib
 import random
-import select
 import socket
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
 LONGEST = 65_535
+Place = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,21 +30,18 @@ class Harm:
 class Relay:
     """Listens on 127.0.0.1:`port` and passes datagrams to and from `server`. Ends with `close`.
 
-    on_datagram: is given every datagram that arrives, before harm is done to it.
+    on_datagram: is given every datagram that arrives, before harm is done to it. lost: datagrams.
     """
 
-    def __init__(
-        self, server: tuple[str, int], harm: Harm, on_datagram: Callable[[bytes], None] = lambda data: None
-    ) -> None:
+    def __init__(self, server: Place, harm: Harm, on_datagram: Callable[[bytes], None] = lambda data: None) -> None:
         self._server, self._harm, self._on_datagram = server, harm, on_datagram
-        self._random = random.Random(harm.seed)  # noqa: S311 - a bad network, not a secret
-        self._near, self._far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        self._near.bind(("127.0.0.1", 0))
-        self._far.bind(("127.0.0.1", 0))
-        self.port: int = self._near.getsockname()[1]
-        self._client: tuple[str, int] | None = None
-        self._held: dict[socket.socket, tuple[bytes, tuple[str, int]]] = {}
-        self.lost = 0  # datagrams
+        self._chance = random.Random(harm.seed).random  # noqa: S311 - a bad network, not a secret
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self.port: int = self._socket.getsockname()[1]
+        self._held: dict[Place, bytes] = {}
+        self.lost = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="relay", daemon=True)
         self._thread.start()
@@ -52,34 +49,32 @@ class Relay:
     def close(self) -> None:
         self._stop.set()
         self._thread.join(5)
-        self._near.close()
-        self._far.close()
+        self._socket.close()
 
     def _run(self) -> None:
+        client: Place | None = None
         while not self._stop.is_set():
-            for sock in select.select([self._near, self._far], [], [], 0.05)[0]:
-                try:
-                    data, sender = sock.recvfrom(LONGEST)
-                except OSError:
-                    continue  # news that a datagram found nobody; UDP promises no more
-                self._on_datagram(data)
-                if sock is self._near:
-                    self._client = sender
-                    self._pass(self._far, data, self._server)
-                elif self._client is not None:
-                    self._pass(self._near, data, self._client)
+            try:
+                data, sender = self._socket.recvfrom(LONGEST)
+            except OSError:
+                continue  # nothing came; or a datagram met a closed port
+            self._on_datagram(data)
+            if sender != self._server:
+                client = sender
+                self._pass(data, self._server)
+            elif client is not None:
+                self._pass(data, client)
 
-    def _pass(self, out: socket.socket, data: bytes, to: tuple[str, int]) -> None:
-        chance = self._random.random
-        if chance() < self._harm.loss:
+    def _pass(self, data: bytes, to: Place) -> None:
+        if self._chance() < self._harm.loss:
             self.lost += 1
             return
-        if out not in self._held and chance() < self._harm.reorder:
-            self._held[out] = data, to  # goes after the next one
+        if to not in self._held and self._chance() < self._harm.reorder:
+            self._held[to] = data  # goes after the next one
             return
-        going = [(data, to)] * (2 if chance() < self._harm.duplicate else 1)
-        if out in self._held:
-            going.append(self._held.pop(out))
+        going = [data] * (2 if self._chance() < self._harm.duplicate else 1)
+        if to in self._held:
+            going.append(self._held.pop(to))
         for each in going:
             with contextlib.suppress(OSError):  # lost, too
-                out.sendto(*each)
+                self._socket.sendto(each, to)

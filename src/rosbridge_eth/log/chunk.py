@@ -59,7 +59,8 @@ MAX_CHUNK: Final = MAX_HEADER + identity.SIGNATURE_SIZE + MAX_BODY
 
 #: zstd's level, chosen by benchmarks/bench_log.py.
 LEVEL: Final = 9
-_MAGIC = b"\x28\xb5\x2f\xfd"
+#: How every frame begins: magic, then a descriptor that says one segment, size in 4 bytes, no checksum, no dictionary.
+_FRAME = b"\x28\xb5\x2f\xfd\xa0"
 _MAX_BLOCK = 128 * 1024  # RFC 8878, 3.1.1.2.4
 
 Randomness = Callable[[int], bytes]
@@ -279,12 +280,19 @@ def _compressed(content: bytes, level: int) -> bytes:
     # Messages are long repetitions with digits between them. Matches of three digits, or far away, cost more
     # bits than the digits themselves: 68 bytes a record instead of 82 (see benchmarks/bench_log.py).
     of = zstd.CompressionParameter
-    return zstd.compress(content, options={of.compression_level: level, of.min_match: 6, of.hash_log: 14})
+    options: dict[int, int] = {of.compression_level: level, of.min_match: 6, of.hash_log: 14}
+    return _framed(zstd.compress(content, options=options), content)
+
+
+def _framed(frame: bytes, content: bytes) -> bytes:
+    """The frame with the one header that is taken; the blocks are the same. RFC 8878, 3.1.1.1."""
+    single, size = frame[4] >> 5 & 1, (0, 2, 4, 8)[frame[4] >> 6]
+    return _FRAME + len(content).to_bytes(4, "little") + frame[6 + (size or single) - single :]
 
 
 def _stored(content: bytes) -> bytes:
-    """A frame of raw blocks (RFC 8878, 3.1.1.1 and 3.1.1.2): single segment, content size in 4 bytes."""
-    parts = [_MAGIC, b"\xa0", len(content).to_bytes(4, "little")]
+    """A frame of raw blocks (RFC 8878, 3.1.1.2)."""
+    parts = [_FRAME, len(content).to_bytes(4, "little")]
     for at in range(0, len(content), _MAX_BLOCK):
         block = content[at : at + _MAX_BLOCK]
         last = at + len(block) == len(content)
@@ -371,8 +379,8 @@ def open_lines(log: Log, chunk: Chunk, key: bytes) -> tuple[bytes, ...]:
 
 def _unpack(header: Header, plaintext: bytes) -> tuple[bytes, ...]:
     """The lines of a plaintext; memory and time are bounded whatever it holds."""
-    if not plaintext.startswith(_MAGIC):  # libzstd would take skippable frames and old formats as well
-        raise Unopenable(f"{header} holds no zstd frame")
+    if not plaintext.startswith(_FRAME):  # libzstd would take skippable frames and old formats as well
+        raise Unopenable(f"{header} holds no zstd frame in the one form")
     window = {int(zstd.DecompressionParameter.window_log_max): MAX_PLAINTEXT.bit_length() - 1}
     unpacking = zstd.ZstdDecompressor(options=window)
     try:

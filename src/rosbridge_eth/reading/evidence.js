@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Checks the evidence of a robot's records, as docs/evidence.md says it, with nothing but the language: SM3, keccak-256,
+// Checks the evidence of a robot's records, as docs/evidence.md says it, with nothing but the language: SM3,
 // SM2 signatures and X.509 (RFC 5280, as far as a robot's certificates go). It is written
 // from that page and docs/log.md, not from the Python; tests hold both against each other and against the standards.
 //
@@ -79,75 +79,6 @@ const evidence = (() => {
     }
     const digest = new DataView(new ArrayBuffer(32))
     v.forEach((value, n) => digest.setInt32(4 * n, value))
-    return new Uint8Array(digest.buffer)
-  }
-
-  // ---------------------------------------------------------------- keccak-256 (Ethereum's: the padding before FIPS 202)
-
-  // Lanes are pairs of 32 bits, low one first. Places and turns of rho and pi, and the constants of iota, as FIPS 202
-  // derives them (3.2.2 to 3.2.5).
-  const PLACES = []
-  const TURNS = []
-  const CONSTANTS = []
-  for (let round = 0, x = 1, y = 0, lfsr = 1; round < 24; round++) {
-    ;[x, y] = [y, (2 * x + 3 * y) % 5]
-    PLACES.push(2 * (5 * y + x))
-    TURNS.push((((round + 1) * (round + 2)) / 2) % 64)
-    const constant = [0, 0]
-    for (let j = 0; j < 7; j++) {
-      if (lfsr & 1) constant[j === 6 ? 1 : 0] |= 1 << (2 ** j - 1) % 32
-      lfsr = ((lfsr << 1) ^ ((lfsr >> 7) * 0x171)) & 0xff
-    }
-    CONSTANTS.push(constant)
-  }
-  const turn = (low, high, n) => (n < 32 ? (low << n) | (high >>> (32 - n)) : (high << (n - 32)) | (low >>> (64 - n)))
-
-  function permute(s) {
-    const c = new Int32Array(10)
-    for (const [low, high] of CONSTANTS) {
-      for (let x = 0; x < 10; x++) c[x] = s[x] ^ s[x + 10] ^ s[x + 20] ^ s[x + 30] ^ s[x + 40]
-      for (let x = 0; x < 10; x += 2) {
-        const before = (x + 8) % 10
-        const after = (x + 2) % 10
-        const l = c[before] ^ turn(c[after], c[after + 1], 1)
-        const h = c[before + 1] ^ turn(c[after + 1], c[after], 1)
-        for (let y = x; y < 50; y += 10) {
-          s[y] ^= l
-          s[y + 1] ^= h
-        }
-      }
-      let l = s[2]
-      let h = s[3]
-      for (let t = 0; t < 24; t++) {
-        const place = PLACES[t]
-        const [nextL, nextH] = [s[place], s[place + 1]]
-        s[place] = turn(l, h, TURNS[t])
-        s[place + 1] = turn(h, l, TURNS[t])
-        ;[l, h] = [nextL, nextH]
-      }
-      for (let y = 0; y < 50; y += 10) {
-        for (let x = 0; x < 10; x++) c[x] = s[y + x]
-        for (let x = 0; x < 10; x++) s[y + x] ^= ~c[(x + 2) % 10] & c[(x + 4) % 10]
-      }
-      s[0] ^= low
-      s[1] ^= high
-    }
-  }
-
-  function keccak(...parts) {
-    const message = join(...parts)
-    const padded = new Uint8Array((Math.floor(message.length / 136) + 1) * 136)
-    padded.set(message)
-    padded[message.length] ^= 0x01
-    padded[padded.length - 1] ^= 0x80
-    const view = new DataView(padded.buffer)
-    const s = new Int32Array(50)
-    for (let at = 0; at < padded.length; at += 136) {
-      for (let n = 0; n < 34; n++) s[n] ^= view.getInt32(at + 4 * n, true)
-      permute(s)
-    }
-    const digest = new DataView(new ArrayBuffer(32))
-    for (let n = 0; n < 8; n++) digest.setInt32(4 * n, s[n], true)
     return new Uint8Array(digest.buffer)
   }
 
@@ -342,7 +273,6 @@ const evidence = (() => {
   }
   const isSigned = (chunk, log, key) => signed(
     key, join(utf8.encode(`rosbridge-eth/2 ${chunk.bare ? 'dropped' : 'chunk'}\0`), log, chunk.encoded), chunk.r, chunk.s)
-  const logOf = (chain, genesis, contract, robot) => join(sm3(word(chain), genesis, contract), keccak(utf8.encode(robot)))
 
   // RFC 9162, 2.1.3.2, with its names.
   function proven(root, records, index, salt, line, path) {
@@ -420,7 +350,7 @@ const evidence = (() => {
     } catch {
       throw new Wrong('this is no evidence: it is not JSON')
     }
-    members(file, 'format,robot,chain_id,genesis,contract,authorities,certificates,chunks,records', 'the file')
+    members(file, 'format,robot,tk,chain_id,genesis,contract,authorities,certificates,chunks,records', 'the file')
     need(file.format === 'rosbridge-eth evidence 3', 'this is evidence of another format')
     const escaped = (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0')
     need(JSON.stringify(file).replace(/[<\u007f-\uffff]/g, escaped) === text.trim(), 'the file is not in its one form')
@@ -448,7 +378,7 @@ const evidence = (() => {
     const file = read(text)
     const { robot } = file
     const [genesis, contract] = [unhex(file.genesis, 32, 'the first block'), unhex(file.contract, 20, 'the contract')]
-    const log = logOf(file.chain_id, genesis, contract, robot)
+    const log = join(sm3(word(file.chain_id), genesis, contract), unhex(file.tk, 32, 'Tk'))
     const authorities = file.authorities.map((one) => unhex(one, undefined, "a CA's certificate"))
     told('the file is whole and in its one form')
 
@@ -467,11 +397,11 @@ const evidence = (() => {
     need(ascending(file.chunks.map(({ chunk }) => chunk)), 'the chunks are not in order')
     const chunks = new Map(file.chunks.map((written) => {
       const encoded = unhex(written.encoded, undefined, 'a chunk')
-      const hashes = written.hashes.map((one) => hex(unhex(one, 32, 'a hash of a batch')))
-      need(hashes[written.chunk - written.first] === hex(keccak(encoded)),
-        `chunk ${written.chunk} is not the one that its batch has there`)
+      for (const one of written.hashes) unhex(one, 32, 'a hash of a batch')
+      need(written.hashes[written.chunk - written.first], `chunk ${written.chunk} is of no batch`)
       const [chunk, by] = [chunkOf(encoded), signers[written.certificate]]
       need(by && isSigned(chunk, log, by.key), `the robot did not sign chunk ${written.chunk}`)
+      need(chunk.bare || hex(sm3(chunk.body)) === chunk.bodyDigest, `the body of chunk ${written.chunk} is another`)
       need(chunk.sealed <= by.until, `chunk ${written.chunk} was sealed after the end of the robot's certificate`)
       return [written.chunk, { ...chunk, written }]
     }))
@@ -503,8 +433,7 @@ const evidence = (() => {
   }
 
   return {
-    verify, sm3, keccak, signed, grouped, Wrong, hex, unhex, join, word, big, certificate, element, signer, chunkOf, isSigned,
-    logOf, lineOf,
+    verify, sm3, signed, grouped, Wrong, hex, unhex, join, word, big, certificate, element, signer, chunkOf, isSigned, lineOf,
   }
 })()
 if (typeof module === 'object') module.exports = evidence

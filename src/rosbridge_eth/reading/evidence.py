@@ -29,14 +29,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rosbridge_eth.capture import MessageLine, parse_line
 
 from rosbridge_eth.log.chunk import (  # isort: skip
-    Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id, verify_signature,
+    Chunk, Header, Log, Proof, check_proof, ledger_id, open_lines, proofs, robot_id, verify as verify_chunk,
 )  # fmt: skip
 from rosbridge_eth.config.values import counted, time_text
-from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
-from rosbridge_eth.identity import Role, Trust, split_certificates
-from rosbridge_eth.reading.verdict import grouped, printable, shown
-from rosbridge_eth.reading.verify import LAST_MOMENT, ProvenRecord, Verifier
-from smcrypto import CertificateError, InvalidKey, sm2, sm3, x509
+from rosbridge_eth.errors import ChainError, ConfigError, VerificationError
+from rosbridge_eth.identity import Trust
+from rosbridge_eth.reading.outputs import proof
+from rosbridge_eth.reading.verdict import grouped, shown
+from rosbridge_eth.reading.verify import LAST_MOMENT, Place, ProvenRecord, Verifier, fingerprint_of, signer
+from smcrypto import sm2, sm3, x509
 
 if TYPE_CHECKING:
     from rosbridge_eth.reading.fetch import Reading
@@ -90,10 +91,14 @@ class Written(_Part):
 
 
 class Evidence(_Part):
-    """What the file holds. certificates: the robot's, each signing and encryption, as they were registered."""
+    """What the file holds. tk: keccak256 of the robot's name, so that a page without keccak can check its signatures.
+
+    certificates: the robot's, each signing and encryption, as they were registered.
+    """
 
     format: Literal["rosbridge-eth evidence 3"] = FORMAT
     robot: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,62}$")]
+    tk: Hex32
     chain_id: Count
     genesis: Hex32
     contract: Annotated[bytes, Field(min_length=20, max_length=20)]
@@ -104,7 +109,7 @@ class Evidence(_Part):
 
     @property
     def log(self) -> Log:
-        return Log(ledger_id(self.chain_id, self.genesis, self.contract), robot_id(self.robot))
+        return Log(ledger_id(self.chain_id, self.genesis, self.contract), self.tk)
 
     def encode(self) -> str:
         """The one form: ASCII without spaces, members as above; "<" is escaped, so that no page can end in it."""
@@ -148,30 +153,6 @@ class Evidence(_Part):
 # Checking
 
 
-class ShownRecord(NamedTuple):
-    """A record that holds, of a chunk that the robot signed, which says itself where it was written."""
-
-    number: int
-    line: bytes
-    content: MessageLine
-    header: Header
-    written: Written
-
-    def as_json(self) -> dict[str, Any]:
-        """As outputs.proof; the file does not say when its block was made."""
-        header, written = self.header, self.written
-        return {
-            "chunk": written.chunk, "record": self.number, "stream": header.stream.hex(), "number": header.number,
-            "digest": header.digest.hex(), "sealed": time_text(header.sealed_ms * 10**6),
-            "block": written.block, "block_time": None, "transaction": "0x" + written.transaction.hex(),
-        }  # fmt: skip
-
-    def json_line(self) -> str:
-        """As `read` gives it: the robot's own line with `proof`; nothing in it acts on a terminal."""
-        proof = json.dumps(self.as_json(), separators=(",", ":"))
-        return f'{printable(self.line.decode())[:-1]},"proof":{proof}}}\n'
-
-
 class Statement(NamedTuple):
     """What a file shows. authorities, certificates: fingerprints of the CA's and of the robot's signing ones."""
 
@@ -181,18 +162,18 @@ class Statement(NamedTuple):
     contract: str
     authorities: tuple[str, ...]
     certificates: tuple[str, ...]
-    records: tuple[ShownRecord, ...]
+    records: tuple[ProvenRecord, ...]
 
     def as_json(self) -> dict[str, Any]:
         return {
             "robot": self.robot, "chain_id": self.chain_id, "genesis": self.genesis, "contract": self.contract,
             "authorities": self.authorities, "certificates": self.certificates,
-            "records": [{"line": one.line.decode(), "proof": one.as_json()} for one in self.records],
+            "records": [{"line": one.line.decode(), "proof": proof(one)} for one in self.records],
         }  # fmt: skip
 
     def proves(self, asked: Asked | None = None) -> Iterator[str]:
         """asked: what a node has said of it."""
-        sealed = [one.header.sealed_ms * 10**6 for one in self.records]
+        sealed = [one.place.sealed_ms * 10**6 for one in self.records]
         low, high = time_text(min(sealed)), time_text(max(sealed))
         yield (
             f"The robot {self.robot} signed {counted(len(self.records), 'record')} as given here, sealed"
@@ -214,7 +195,7 @@ class Statement(NamedTuple):
         if asked is not None:
             yield f"That {asked.node} is a node of the right chain, and that the chain will not replace these blocks."
         else:
-            blocks = sorted({one.written.block for one in self.records})
+            blocks = sorted({one.place.block for one in self.records})
             span = str(blocks[0]) if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
             yield (
                 f"That the chain has it, in block {span} as the file says: ask a node (--node). If it has not, somebody"
@@ -237,25 +218,25 @@ class Asked(NamedTuple):
     revoked: bool
 
 
-class _Signer(NamedTuple):
-    key: sm2.PublicKey
-    fingerprint: str
-    ends_ms: int
-
-
 def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable[[str], None]) -> Statement:
     """What the evidence shows, if all of it holds under `roots`; else VerificationError. Asks nobody.
 
     told: is given a line for each check that held. Nothing is shown that no check needed.
     """
     e = evidence
+    if e.tk != robot_id(e.robot):
+        raise VerificationError(f"the chunks are not of the log of {e.robot}")
     trusted = [root for root in roots if root.to_der() in e.authorities]
     if len(trusted) != len(e.authorities) or not _ascend(e.authorities):
         raise VerificationError(f"the evidence is under another CA, {_fingerprints(e.authorities)}")
     told(f"the CA is the one that was given: {_fingerprints(e.authorities)}")
-    signers = [_signer(e.robot, Trust(trusted), one) for one in e.certificates]
-    for signer in signers:
-        told(f"the CA made the robot's certificate {grouped(signer.fingerprint)}")
+    fingerprints = [fingerprint_of(one) for one in e.certificates]
+    try:
+        signers = [signer(one, Trust(trusted), e.robot) for one in e.certificates]
+    except VerificationError as error:
+        raise VerificationError(f"no certificate of this robot that is to be trusted: {error}") from None
+    for fingerprint in fingerprints:
+        told(f"the CA made the robot's certificate {grouped(fingerprint)}")
     if not _ascend([one.chunk for one in e.chunks]):
         raise VerificationError("the chunks are not in order")
     headers = {one.chunk: _header(e.log, one, signers) for one in e.chunks}
@@ -263,46 +244,32 @@ def verify(evidence: Evidence, roots: Sequence[x509.Certificate], told: Callable
         raise VerificationError("there are certificates of which no chunk is")
     told("the robot signed the chunk of each record")
     records = tuple(_records_of(evidence, headers))
-    if {one.written.chunk for one in records} != headers.keys():
+    if {one.place.chunk for one in records} != headers.keys():
         raise VerificationError("there are chunks of which no record is")
     told("each record's path leads to the root of its chunk")
     return Statement(
         e.robot, e.chain_id, "0x" + e.genesis.hex(), "0x" + e.contract.hex(),
-        tuple(sm3.digest(one).hex() for one in e.authorities), tuple(one.fingerprint for one in signers), records,
+        tuple(sm3.digest(one).hex() for one in e.authorities), tuple(fingerprints), records,
     )  # fmt: skip
 
 
-def _signer(robot: str, trust: Trust, certificates: bytes) -> _Signer:
-    """Of a registration's two certificates, if the CA made them for this robot; judged by when they begin."""
-    try:
-        pair = split_certificates(certificates)
-        begin = max(x509.Certificate.from_der(der).not_before for der in pair)
-        peer = trust.check(*pair, role=Role.ROBOT, name=robot, at=begin)
-    except (IdentityError, VerificationError, CertificateError, InvalidKey) as error:
-        raise VerificationError(f"no certificate of this robot that is to be trusted: {shown(str(error))}") from None
-    ends_ms = round(peer.not_after.timestamp() * 1000)
-    return _Signer(peer.signing_certificate.public_key, sm3.digest(pair[0]).hex(), ends_ms)
-
-
-def _header(log: Log, written: Written, signers: Sequence[_Signer]) -> Header:
-    """The header of a chunk that the robot signed, sealed before its certificate ended, and that is in its batch."""
+def _header(log: Log, written: Written, signers: Sequence[tuple[sm2.PublicKey, int, int]]) -> Header:
+    """The header of a chunk that the robot signed, sealed before its certificate ended."""
     place = written.chunk - written.first
     if written.certificate >= len(signers) or not 0 <= place < len(written.hashes):
-        raise VerificationError(f"chunk {written.chunk} is of no certificate or batch")
-    if written.hashes[place] != keccak(written.encoded):
-        raise VerificationError(f"chunk {written.chunk} is not the one that its batch has there")
-    signer = signers[written.certificate]
+        raise VerificationError(f"chunk {written.chunk} is of no certificate, or of no batch")
+    key, _, ends = signers[written.certificate]
     try:
         chunk = Chunk.parse(written.encoded)
-        verify_signature(log, signer.key, chunk)
+        verify_chunk(log, key, chunk)
     except VerificationError as error:
         raise VerificationError(f"chunk {written.chunk}: {shown(str(error))}") from None
-    if chunk.header.sealed_ms > signer.ends_ms:
+    if chunk.header.sealed_ms > ends:
         raise VerificationError(f"chunk {written.chunk} was sealed after the end of the robot's certificate")
     return chunk.header
 
 
-def _records_of(evidence: Evidence, headers: dict[int, Header]) -> Iterator[ShownRecord]:
+def _records_of(evidence: Evidence, headers: dict[int, Header]) -> Iterator[ProvenRecord]:
     if not _ascend([(one.chunk, one.record) for one in evidence.records]):
         raise VerificationError("the records are not in order")
     written = {one.chunk: one for one in evidence.chunks}
@@ -310,15 +277,18 @@ def _records_of(evidence: Evidence, headers: dict[int, Header]) -> Iterator[Show
         where = f"record {one.record} of chunk {one.chunk}"
         if one.chunk not in headers:
             raise VerificationError(f"{where}: its chunk is not in the file")
+        header, of = headers[one.chunk], written[one.chunk]
         try:
-            header, line = headers[one.chunk], one.line.encode()
+            line = one.line.encode()
             check_proof(header.root, header.records, line, Proof(one.record, one.salt, tuple(one.path)))
             content = parse_line(line)
         except (VerificationError, UnicodeEncodeError) as error:
             raise VerificationError(f"{where}: {shown(str(error), 300)}") from None
         if not isinstance(content, MessageLine):
             raise VerificationError(f"{where}: it is no captured message")
-        yield ShownRecord(one.record, line, content, header, written[one.chunk])
+        place = Place(one.chunk, header.stream, header.number, header.digest, of.block, None, of.transaction,
+                      header.sealed_ms)  # fmt: skip
+        yield ProvenRecord(place, one.record, line, content, None)
 
 
 def _ascend(values: Sequence[Any]) -> bool:
@@ -383,40 +353,27 @@ def make(reading: Reading, records: Sequence[ProvenRecord]) -> Evidence:
 
 
 def _made(reading: Reading, records: Sequence[ProvenRecord]) -> Evidence:
-    ledger, log, top = reading.ledger, reading.verifier.log, reading.top
+    ledger, log = reading.ledger, reading.verifier.log
     numbers = defaultdict[int, set[int]](set)
     for record in records:
         numbers[record.place.chunk].add(record.number)
-    [standing] = ledger.standings([log.tk], top.number)
-    registrations = ledger.registrations(log.tk, standing)
     certificates, chunks, shown_records = list[bytes](), list[Written](), list[Record]()
-    for block in sorted({record.place.block for record in records}):
-        for event in ledger.data_events(log.tk, block, block):
-            hashes = [keccak(encoded) for encoded in event.chunks]
-            for index, encoded in enumerate(event.chunks, event.first):
-                if index not in numbers:
-                    continue
-                pair = [one for one in registrations if one.index <= index][-1].certificates
-                if pair not in certificates:
-                    certificates.append(pair)
-                chunks.append(Written(
-                    chunk=index, certificate=certificates.index(pair), encoded=encoded, first=event.first,
-                    hashes=hashes, block=block, transaction=event.transaction,
-                ))  # fmt: skip
-                shown_records += _proven(reading, index, encoded, numbers.pop(index))
-    if numbers:
-        raise ChainError("the chain was reorganised meanwhile; do it again")
+    for event, index, chunk in reading.again(record.place for record in records):
+        pair = [one for one in reading.registrations if one.index <= index][-1].certificates
+        if pair not in certificates:
+            certificates.append(pair)
+        chunks.append(Written(
+            chunk=index, certificate=certificates.index(pair), encoded=chunk.encoded, first=event.first,
+            hashes=[keccak(encoded) for encoded in event.chunks], block=event.block, transaction=event.transaction,
+        ))  # fmt: skip
+        key = reading.verifier.key_of(chunk.header)
+        lines = open_lines(log, chunk, key)
+        shown_records += [
+            Record(chunk=index, record=one.index, line=lines[one.index].decode(), salt=one.salt, path=list(one.path))
+            for one in proofs(lines, key, sorted(numbers[index]))
+        ]
     return Evidence(
-        robot=reading.verifier.name, chain_id=ledger.chain_id, genesis=ledger.genesis,
+        robot=reading.verifier.name, tk=log.tk, chain_id=ledger.chain_id, genesis=ledger.genesis,
         contract=bytes.fromhex(ledger.contract[2:]), authorities=sorted(root.to_der() for root in reading.trust.roots),
         certificates=certificates, chunks=chunks, records=shown_records,
     )  # fmt: skip
-
-
-def _proven(reading: Reading, index: int, encoded: bytes, numbers: set[int]) -> Iterator[Record]:
-    """Records of a chunk, each with its way up to the root: for that the chunk is opened once more, with all lines."""
-    chunk = Chunk.parse(encoded)
-    key = reading.verifier.key_of(chunk.header)
-    lines = open_lines(reading.verifier.log, chunk, key)
-    for one in proofs(lines, key, sorted(numbers)):
-        yield Record(chunk=index, record=one.index, line=lines[one.index].decode(), salt=one.salt, path=list(one.path))

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError
 from rosbridge_eth.identity import Trust, check_name
-from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.reading.memo import Memo
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind, Links, Progress, Verdict, shown
-from rosbridge_eth.reading.verify import EVERYTHING, Choice, ProvenChunk, ProvenRecord, Verifier, digest_of
+from rosbridge_eth.reading.verify import EVERYTHING, Choice, Place, ProvenChunk, ProvenRecord, Verifier, digest_of
 from smcrypto import sm2
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger.contract import Block, Ledger, RegistrationEvent, Standing
+    from rosbridge_eth.ledger.contract import Block, DataEvent, Ledger, RegistrationEvent, Standing
 
 MAX_TOPICS = 1_000
 BEHIND = 8
@@ -58,6 +58,23 @@ class Reading:
         """For a person who named a topic that is not there: MAX_TOPICS at most, whatever a log holds."""
         if len(self.topics) < MAX_TOPICS:
             self.topics.update(islice(more, MAX_TOPICS))
+
+    def again(self, places: Iterable[Place]) -> Iterator[tuple[DataEvent, int, Chunk]]:
+        """Of a log that is read to its end, these chunks once more, with index and batch: a reading keeps none.
+
+        ChainError where the node does not show again what it showed.
+        """
+        wanted = {place.chunk: place for place in places}
+        blocks = {place.block for place in wanted.values()}
+        tk = self.verifier.log.tk
+        for event in self.ledger.data_events(tk, min(blocks), max(blocks)) if blocks else ():
+            for index, encoded in enumerate(event.chunks, event.first):
+                place = wanted.get(index)
+                if place is not None and (place.digest, place.block) == (digest_of(encoded), event.block):
+                    del wanted[index]
+                    yield event, index, Chunk.parse(encoded)
+        if wanted:
+            raise ChainError(f"{shown(self.ledger.url)} does not show again what it showed; do it once more")
 
     def verdict(self) -> Verdict:
         return self.verifier.verdict(self.nodes)

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import secrets
 from collections import defaultdict
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
 from pydantic import AwareDatetime, BaseModel, StringConstraints
 
-from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
+from rosbridge_eth.errors import ConfigError, IdentityError, VerificationError
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust, public_identity, sign, verify
-from rosbridge_eth.log.chunk import KEY_SIZE, Chunk, Malformed
+from rosbridge_eth.log.chunk import KEY_SIZE
 from rosbridge_eth.reading.fetch import Reading
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.reading.verify import Choice
@@ -53,21 +52,9 @@ class _Document(BaseModel, extra="forbid"):
 
 
 def keys_of(reading: Reading, choice: Choice) -> Keys:
-    """Of a log that is read to its end, the content keys of all chunks that hold a chosen record.
-
-    Their headers are fetched once more, since what is kept of a reading has none.
-    """
-    blocks = {record.place.digest: record.place.block for record in reading.records(choice)}
-    found, tk = Keys(), reading.verifier.log.tk
-    for event in reading.ledger.data_events(tk, min(blocks.values()), max(blocks.values())) if blocks else ():
-        for encoded in event.chunks:
-            with suppress(Malformed):
-                header = Chunk.parse(encoded).header
-                if header.digest in blocks:
-                    found[header.digest] = reading.verifier.key_of(header)
-    if len(found) < len(blocks):
-        raise ChainError(f"{reading.ledger.url} does not show again what it showed; grant once more")
-    return found
+    """Of a log that is read to its end, the content keys of all chunks that hold a chosen record."""
+    again = reading.again(record.place for record in reading.records(choice))
+    return {chunk.header.digest: reading.verifier.key_of(chunk.header) for _, _, chunk in again}
 
 
 def make(

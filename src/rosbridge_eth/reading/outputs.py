@@ -71,7 +71,8 @@ def proof(record: ProvenRecord) -> dict[str, Any]:
     return {
         "chunk": place.chunk, "record": record.number, "stream": place.stream.hex(), "number": place.number,
         "digest": place.digest.hex(), "sealed": time_text(place.sealed_ms * 10**6), "block": place.block,
-        "block_time": time_text(place.block_time * 10**9), "transaction": "0x" + place.transaction.hex(),
+        "block_time": None if place.block_time is None else time_text(place.block_time * 10**9),
+        "transaction": "0x" + place.transaction.hex(),
     }  # fmt: skip
 
 

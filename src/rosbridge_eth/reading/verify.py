@@ -58,14 +58,14 @@ class Facts(Protocol):
 
 class Place(NamedTuple):
     """Where a chunk stands. chunk: its index in the robot's log on the chain. block_time: seconds since 1970, by the
-    chain; sealed_ms: milliseconds, by the robot."""
+    chain, None where nobody asked it; sealed_ms: milliseconds, by the robot."""
 
     chunk: int
     stream: bytes
     number: int
     digest: bytes
     block: int
-    block_time: int
+    block_time: int | None
     transaction: bytes
     sealed_ms: int
 
@@ -172,23 +172,15 @@ class Verifier:
     # --- certificates
 
     def _signer(self, event: RegistrationEvent) -> Governing:
-        """Trusted if the certificates are the robot's, of the CA, and had not ended when they were registered.
-
-        They may begin later than their block's time: that is a chain whose clock is behind.
-        """
         key, why, begins, ends, fingerprint = None, "revoked", 0, 0, ""
         if not event.revoked:
-            fingerprint = sm3.digest(event.certificates).hex()
+            fingerprint = fingerprint_of(event.certificates)
             try:
-                pair = split_certificates(event.certificates)
-                fingerprint = sm3.digest(pair[0]).hex()
-                begin = max(x509.Certificate.from_der(der).not_before for der in pair)
-                at = max(begin, datetime.fromtimestamp(self._time(event.block), UTC))
-                peer = self._trust.check(*pair, role=Role.ROBOT, name=self.name, at=at)
-                key, why = peer.signing_certificate.public_key, ""
-                begins, ends = (round(moment.timestamp() * 1000) for moment in (begin, peer.not_after))
-            except (IdentityError, VerificationError, CertificateError, InvalidKey) as error:
-                why = shown(str(error))
+                at = datetime.fromtimestamp(self._time(event.block), UTC)
+                key, begins, ends = signer(event.certificates, self._trust, self.name, at)
+                why = ""
+            except VerificationError as error:
+                why = str(error)
         new = self._mark is not None and not event.revoked and fingerprint not in self._mark.fingerprints
         if new:
             self.findings.add(Kind.NEW_CERTIFICATE, event.index, detail=fingerprint)
@@ -449,6 +441,30 @@ class Verifier:
         now = [signer.fingerprint for signer in self._signers if not signer.revoked]
         known = now if confirm or self._mark is None else self._mark.fingerprints
         return Bookmark(self._at.count, self._at.digest, tuple(dict.fromkeys(known)))
+
+
+def signer(certificates: bytes, trust: Trust, name: str, at: datetime | None = None) -> tuple[sm2.PublicKey, int, int]:
+    """The robot's key of a registration, and from when to when it holds, in ms; VerificationError says why not.
+
+    The certificates are the robot's, of the CA, and had not ended at the time of the block, or, if that is later, when
+    both began: a chain's clock may be behind. at: None where nobody says the block's time.
+    """
+    try:
+        pair = split_certificates(certificates)
+        begin = max(x509.Certificate.from_der(der).not_before for der in pair)
+        peer = trust.check(*pair, role=Role.ROBOT, name=name, at=max(begin, at or begin))
+    except (IdentityError, VerificationError, CertificateError, InvalidKey) as error:
+        raise VerificationError(shown(str(error))) from None
+    begins, ends = (round(moment.timestamp() * 1000) for moment in (begin, peer.not_after))
+    return peer.signing_certificate.public_key, begins, ends
+
+
+def fingerprint_of(certificates: bytes) -> str:
+    """SM3 of a registration's signing certificate, or of all of it where it is not two."""
+    try:
+        return sm3.digest(split_certificates(certificates)[0]).hex()
+    except VerificationError:
+        return sm3.digest(certificates).hex()
 
 
 def digest_of(encoded: bytes) -> bytes:

@@ -1,10 +1,10 @@
 """The robot's end: captures, writes chunks into the spool, and brings to the server what it does not have.
 
-    source's thread -> ring -> Robot's loop: capture -> writer -> spool -> Sender -> channel
+    source's threads -> Queue -> Robot's loop: capture -> writer -> spool -> Sender -> channel
 
-The source's thread only puts raw messages into a bounded ring; everything that has state belongs to the loop, which
-lets messages gather for GATHER between two turns. Where the ring is full a bag waits, and a live source drops and
-counts, which becomes `lost` lines of the log.
+The source's threads only put raw messages into a bounded queue; everything that has state belongs to the loop, which
+lets messages gather for GATHER between two turns. Where the queue is full a bag waits, and messages of a live source
+are dropped and counted, which becomes `lost` lines of the log.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
 from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
+from rosbridge_eth.robot.sources.queue import Queue
 from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.terminal import Trouble
 from smcrypto import __version__, sm2, x509
@@ -42,9 +43,10 @@ from smcrypto import __version__, sm2, x509
 log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
-RING, RING_BYTES = 4096, 64 << 20  # raw messages between the source's thread and the loop, and their bytes
+REPLAYED_BYTES = 4 << 20  # of raw messages between the source and the loop, where the source can wait
+LIVE_BYTES = 128 << 20  # and where it cannot: twice the largest message that is decoded
 TAKE = 128  # raw messages captured before the network gets its turn again
-GATHER = 0.05  # seconds that messages gather in the ring: a turn of the loop costs as much as some of them
+GATHER = 0.05  # seconds that messages gather in the queue: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
@@ -78,9 +80,8 @@ class Robot:
         """Records given to the writer, by topic."""
         self._marks: deque[tuple[bytes, Counter[str]]] = deque()  # place, and records sealed up to there
         self._confirmed = Counter[str]()
-        self._ring: deque[RawMessage] = deque()
-        self._put = self._taken = 0  # bytes that ever went into the ring, counted by its thread, and out of it
-        self._room, self._stop, self._source_ended = threading.Event(), threading.Event(), threading.Event()
+        self._queue = Queue(LIVE_BYTES if source.live else REPLAYED_BYTES, waits=not source.live)
+        self._stop, self._source_ended = threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
         self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
@@ -114,7 +115,11 @@ class Robot:
     @property
     def lost(self) -> dict[tuple[str, str], int]:
         """Messages that are not in the log, by topic and why: lost by the source, refused, no memory to keep them."""
-        return {**self.source.lost, **self.capture.lost, **self.box.lost}
+        return {**self._source_lost, **self.capture.lost, **self.box.lost}
+
+    @property
+    def _source_lost(self) -> dict[tuple[str, str], int]:
+        return {**self.source.lost, **self._queue.lost}
 
     @property
     def captured(self) -> int:
@@ -143,7 +148,7 @@ class Robot:
             while not self._stop.is_set():
                 now = time.monotonic()
                 self._take(now)
-                if not self._finished and self._source_ended.is_set() and not self._ring and not self.box.released:
+                if not self._finished and self._source_ended.is_set() and not self._queue and not self.box.released:
                     self._finish(now)
                 else:
                     self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
@@ -154,7 +159,8 @@ class Robot:
                     break
                 self.loop.step(self._wait(now))
             else:
-                while (self._ring or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
+                self._queue.close()
+                while (self._queue or self.box.released) and len(self._unspooled) < MAX_UNSPOOLED:
                     self._take(now := time.monotonic())
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 if not self._finished:
@@ -164,7 +170,7 @@ class Robot:
                 self._last_words()
         finally:
             self._stop.set()
-            self._room.set()
+            self._queue.close()
             try:
                 self.client.close(time.monotonic())  # so that the server need not wait for a silent robot
                 self.loop.step(0.0)
@@ -192,17 +198,8 @@ class Robot:
             self.loop.wake()
 
     def _emit(self, raw: RawMessage) -> None:
-        while self._full() and not self._stop.is_set():
-            self._room.clear()
-            if self._full():
-                self._room.wait(0.2)
-        self._put += len(raw.raw)
-        self._ring.append(raw)
-        if len(self._ring) == 1 and time.monotonic() >= self._take_at:  # else it wakes by itself
+        if self._queue.put(raw) and time.monotonic() >= self._take_at:  # else it wakes by itself
             self.loop.wake()
-
-    def _full(self, share: int = 1) -> bool:
-        return len(self._ring) >= RING // share or self._put - self._taken >= RING_BYTES // share
 
     # The loop's thread
 
@@ -214,19 +211,16 @@ class Robot:
                 break
             if self.box.released:  # before anything new, so that no more is kept than was stated
                 self._write(self.box.released.popleft(), now)
-            elif self._ring:
+            elif (raw := self._queue.take()) is not None:
                 self._take_at = now + GATHER
-                self._capture(self._ring.popleft(), now)
+                self._capture(raw, now)
             else:
                 break
-        if not self._full(2):
-            self._room.set()
         if now - self._losses_at >= LOSSES_EVERY and len(self._unspooled) < MAX_UNSPOOLED:
             self._losses_at = now
             self._add_losses(now)
 
     def _capture(self, raw: RawMessage, now: float) -> None:
-        self._taken += len(raw.raw)
         self.box.look(raw)
         record = self.capture.process(raw, time.time_ns(), self._synchronised)
         if record is not None and record.trigger is not None:
@@ -240,7 +234,7 @@ class Robot:
             self.written[record.topic] += 1
 
     def _add_losses(self, now: float) -> None:
-        for line in self.capture.loss_lines({**self.source.lost, **self.box.lost}):
+        for line in self.capture.loss_lines({**self._source_lost, **self.box.lost}):
             self.writer.add(line, now)
 
     def _finish(self, now: float) -> None:
@@ -249,7 +243,7 @@ class Robot:
         self._spool_chunks(self.writer.finish(time.time_ns() // 10**6), now)
 
     def _spool_chunks(self, chunks: list[Chunk], now: float) -> None:
-        """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the ring."""
+        """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the queue."""
         self._unspooled.extend(chunks)
         self.chunks += len(chunks)
         if chunks:
@@ -275,9 +269,9 @@ class Robot:
     def _wait(self, now: float) -> float:
         due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
         if len(self._unspooled) < MAX_UNSPOOLED:
-            if self.box.released or len(self._ring) >= TAKE or (self._ring and self._source_ended.is_set()):
+            if self.box.released or len(self._queue) >= TAKE or (self._queue and self._source_ended.is_set()):
                 return 0.0
-            if self._ring or self._take_at > now:  # until then nobody wakes the loop for a message
+            if self._queue or self._take_at > now:  # until then nobody wakes the loop for a message
                 due = min(due, self._take_at - now)
         return max(0.0, min(LONGEST_WAIT, due))
 
@@ -312,11 +306,11 @@ class Robot:
     def _summarise(self) -> str:
         spool, sender = self.spool.statistics(), self.sender
         lost = {
-            "messages lost before they could be captured": sum(self.source.lost.values()),
+            "messages lost before they could be captured": sum(self._source_lost.values()),
             "messages left out as too large or undecodable": sum(self.capture.lost.values()),
             "records that there was no memory for until their event": self.box.lost.total(),
             "messages lost, since the spool took nothing":
-                len(self._ring) + len(self.box.released) if self._unspooled else 0,
+                len(self._queue) + len(self.box.released) if self._unspooled else 0,
             "chunks lost, since the spool took nothing": len(self._unspooled),
             f"chunks dropped, since the {'disk was full' if self.spool.disk_was_full else 'spool was at its max_size'}":
                 spool.dropped_bodies,

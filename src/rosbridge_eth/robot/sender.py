@@ -21,8 +21,8 @@ from rosbridge_eth.channel import (
     End,
     Event,
     HandshakeFailed,
-    Message,
     Reason,
+    State,
     Unresolved,
 )  # fmt: skip
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk
@@ -109,7 +109,6 @@ class Sender:
             case Connected(peer=peer, server_time=server_time):
                 self.sessions += 1
                 self.connected, self.state, self.refusal = True, None, ""
-                self._client.expecting(True)
                 log.info("connected to %s", peer)
                 if server_time is not None and server_time <= peer.not_after:  # else its clock is wrong
                     self._on_server_time(server_time.timestamp())
@@ -123,8 +122,8 @@ class Sender:
                 todo = "" if isinstance(event, Unresolved) else f"; {mend(event, self._channel)}"
                 self.refusal = why + todo
                 self._warn(why, f"no session: {self.refusal}", now)
-            case Message(payload=payload):
-                self.take(payload, now)
+            case State(data=data):
+                self.take(data, now)
 
     def take(self, data: bytes, now: float) -> None:
         """Take the bytes of the server's state; what comes of it is done by `send`."""
@@ -137,13 +136,12 @@ class Sender:
         known = self.state
         if known is None or state.again != known.again or not known.head <= state.head <= self._sent:
             self._sent, self._digest = state.head, state.digest
-        if known is None or state.head > known.head:
-            self._client.progressed()
         if state.confirmed > self.newest:
             self.newest, self.block = state.confirmed, state.block
         self.state = state
+        log.debug("stream %s: the server has it up to %d", state.head[:STREAM_SIZE].hex(),
+                  int.from_bytes(state.head[STREAM_SIZE:], "big"))
         self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
-        self._client.expecting(self._sent > state.head and not state.why)
         if state.why:
             self._warn(state.why, f"the server takes nothing at this moment: {state.why}", now)
 
@@ -211,9 +209,8 @@ class Sender:
     def _put(self, encoded: bytes, after: bytes = b"") -> bool:
         """Send it, if there is room."""
         offer = encode_offer(encoded, after)
-        if not self._client.writable(len(offer)):
+        if self._client.room() < len(offer):
             return False
         self._client.send(offer)
-        self._client.expecting(True)
         self.sent += 1
         return True

@@ -112,11 +112,15 @@ def survey(
     """
     from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_cost
 
-    source, stop, room = everything(config), threading.Event(), [ENOUGH]
+    source, stop, taking, room = everything(config), threading.Event(), threading.Lock(), [ENOUGH]
     timer = threading.Timer(seconds, stop.set)
     capture = Capture([*config.rules(), TopicRule("**")], source_kind=source.kind, live=True)
 
     def take(raw: RawMessage) -> None:
+        with taking:
+            listen(raw)
+
+    def listen(raw: RawMessage) -> None:
         topic = heard.setdefault(raw.topic, Heard(Offer(raw.topic, raw.type_name)))
         topic.times.append(raw.received_ns)
         topic.size += len(raw.raw)

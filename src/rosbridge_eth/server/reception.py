@@ -69,7 +69,6 @@ class Session:
     state: State = field(default_factory=State)
     again: int = 0
     refused: bytes = NO_DIGEST
-    said: bytes = b""
 
 
 class Reception:
@@ -246,19 +245,11 @@ class Reception:
             self._said[session.peer.name, what] = now
 
     def _say(self, session: Session) -> None:
-        """The state, if it is another than the last; what finds no room now is said at the next look."""
-        said = _said(session)
-        if said != session.said and self.server.writable(session.connection, len(said)):
-            self.server.send(session.connection, said)
-            session.said = said
-
-
-def _said(session: Session) -> bytes:
-    """The state as the robot is told it."""
-    state = session.state
-    return ServerState(
-        state.head, state.digest, state.confirmed, state.block, session.again, session.refused, session.why
-    ).encode()
+        """Have the robot told how its log stands here."""
+        state = session.state
+        self.server.set_state(session.connection, ServerState(
+            state.head, state.digest, state.confirmed, state.block, session.again, session.refused, session.why
+        ).encode())  # fmt: skip
 
 
 class Worker:

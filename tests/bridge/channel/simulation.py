@@ -132,7 +132,9 @@ class Network:
     def run(self, until: Callable[[], bool], *, limit: float = 600.0) -> bool:
         """Step until `until()`; False if `limit` simulated seconds pass, or nothing can happen, before it holds."""
         end = self.now + limit
-        while not until():
+        while True:
+            self.settle()
+            if until():
+                return True
             if self.now >= end or not self.step():
                 return until()
-        return True

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from bridge.channel.world import SERVER_ADDRESS, make_client, make_server
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Drop, Event, Mode, Server, ServerConfig
+from rosbridge_eth.channel.wire import SEGMENT_HEADER, Frame
 
 HERE = ("198.51.100.7", 50000)
-OPEN = {"source_rate": 1e6, "source_burst": 1e6}  # limits on handshakes are a test of their own
+OPEN = {"handshake_share": 1e9}  # the limit on handshakes is a test of its own
 
 
 class Steps:
@@ -47,15 +48,56 @@ class Steps:
         self.offer = self.to_server(*self.until_proof())
         return self.offer
 
-    def until_finished(self) -> bytes:
-        [self.finished] = self.to_client(*self.until_offer())
-        return self.finished
+    def until_first(self) -> bytes:
+        """The client's first packet under the session's keys: a probe."""
+        [self.first] = self.to_client(*self.until_offer())
+        return self.first
 
     def until_connected(self) -> Steps:
-        self.accepted = self.to_server(self.until_finished())
-        self.to_client(*self.accepted)
+        self.answer = self.to_server(self.until_first())
+        self.to_client(*self.answer)
         assert any(isinstance(event, Connected) for event in events(self.client))
         return self
+
+    # Under the session's keys
+
+    @property
+    def session(self):
+        """The server's only session."""
+        [session] = self.server._sessions.values()
+        return session
+
+    @property
+    def connection(self) -> bytes:
+        return self.session.cid
+
+    def sealed(self, frame: bytes) -> bytes:
+        """A packet of the client's keys with any frame at all in it."""
+        session = self.client._session
+        return session.seal(session.sending.take_number(), frame)
+
+    def from_client(self, frame: bytes) -> list[bytes]:
+        return self.to_server(self.sealed(frame))
+
+    def from_server(self, frame: bytes) -> list[bytes]:
+        """Deliver a packet of the server's keys with any frame at all in it."""
+        session = self.session
+        session.credit += 1200
+        return self.to_client(session.seal(frame))
+
+    def sent(self, *payloads: bytes) -> list[bytes]:
+        """The client's packets with these messages."""
+        for payload in payloads:
+            self.client.send(payload)
+        return [data for data, _ in self.client.datagrams_to_send(self.now)]
+
+
+def segment(index: int, data: bytes) -> bytes:
+    return SEGMENT_HEADER.pack(Frame.SEGMENT, index) + data
+
+
+def message(payload: bytes) -> bytes:
+    return len(payload).to_bytes(4, "big") + payload
 
 
 def events(end: Client | Server) -> list[Event]:

@@ -1,8 +1,9 @@
 """Whole conversations on a network made of a seed: what was promised holds whatever the network does.
 
-The invariant: in a session every message arrives once and in order, each way, under loss, duplication, reordering,
-corruption, narrow links, changes of address, and restarts of either end; what is held stays bounded and is given
-back. CHANNEL_SEEDS sets how many seeds are tried, CHANNEL_FIRST_SEED where they begin.
+The invariant: in a session every message arrives once and in order, the state never goes back, and to no address go
+more bytes than came from it, under loss, duplication, reordering, corruption, narrow links, changes of address, and
+restarts of either end; what is held stays bounded and is given back. CHANNEL_SEEDS sets how many seeds are tried,
+CHANNEL_FIRST_SEED where they begin.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import os
 import random
 import statistics
+from itertools import pairwise
 
 import pytest
 
@@ -17,6 +19,7 @@ from bridge.channel.simulation import Faults, Network
 from bridge.channel.world import SERVER_ADDRESS, RobotProgram, ServerProgram
 from bridge.channel.world import robot as enrolled
 from rosbridge_eth.channel import (
+    MAX_STATE,
     ClientConfig,
     Connected,
     Disconnected,
@@ -24,8 +27,9 @@ from rosbridge_eth.channel import (
     End,
     Mode,
     ServerConfig,
+    State,
 )
-from rosbridge_eth.channel.session import NEVER, RESERVED_SEGMENTS
+from rosbridge_eth.channel.transfer import NEVER, RESERVED_SEGMENTS
 from rosbridge_eth.channel.wire import SEGMENT_SIZE
 
 SEEDS = int(os.environ.get("CHANNEL_SEEDS", "100"))
@@ -40,6 +44,27 @@ def messages(draw: random.Random, count: int, who: int = 0) -> list[bytes]:
         size = draw.choice(SIZES) if draw.random() > 0.02 else LONGEST
         found.append((b"%d/%06d " % (who, number)).ljust(size, bytes((draw.randrange(256),)))[: max(size, 10)])
     return found
+
+
+class Balance:
+    """By address, how many more bytes went from the server to it than came to the server from it."""
+
+    def __init__(self, network: Network) -> None:
+        self.worst = 0
+        self._more: dict[tuple[str, int], int] = {}
+        self._deliver, network.inject = network.inject, self._inject
+        self._network = network
+
+    def _inject(self, data: bytes, source: tuple[str, int], target: tuple[str, int], delay: float = 0.0) -> None:
+        if target == SERVER_ADDRESS:
+            came = lambda: self._more.update({source: self._more.get(source, 0) - len(data)})  # noqa: E731
+            self._network.at(self._network.now + delay, came)
+        self._deliver(data, source, target, delay)
+
+    def sent(self, data: bytes, source: tuple[str, int], target: tuple[str, int]) -> None:
+        if source == SERVER_ADDRESS:
+            self._more[target] = self._more.get(target, 0) + len(data)
+            self.worst = max(self.worst, self._more[target])
 
 
 @pytest.mark.parametrize("seed", range(FIRST, FIRST + SEEDS))
@@ -57,11 +82,15 @@ def test_every_message_arrives_once_and_in_order_whatever_the_network_does(seed,
     )
     network = Network(seed, faults)
     sizes: set[int] = set()
-    network.watch = lambda data, source, target: sizes.add(len(data))
-    monkeypatch.setattr("rosbridge_eth.channel.session.SESSION_PACKETS", draw.choice((400, 2000, 1 << 20)))
-    monkeypatch.setattr("rosbridge_eth.channel.session.MAX_BUFFERED", draw.choice((80_000, 1 << 20)))
+    balance = Balance(network)
+    network.watch = lambda data, source, target: (sizes.add(len(data)), balance.sent(data, source, target))
+    packets = draw.choice((400, 2000, 1 << 20))
+    for end in ("client", "server"):
+        monkeypatch.setattr(f"rosbridge_eth.channel.{end}.SESSION_PACKETS", packets)
+    monkeypatch.setattr("rosbridge_eth.channel.transfer.BUFFER", draw.choice((80_000, 1 << 20)))
     limits = ServerConfig(modes=(mode,), max_early=draw.choice((0, 20, 4000)))
     hub = ServerProgram(network, limits, commit_delay=draw.choice((0, 0.005, 0.2)))
+    hub.more = bytes(draw.choice((0, 117, MAX_STATE - 4)))
     sent = messages(draw, draw.choice((5, 40, 80)))
     robot = RobotProgram(network, sent, config=ClientConfig(mode=mode))
     for _ in range(draw.randrange(4)):
@@ -78,6 +107,7 @@ def test_every_message_arrives_once_and_in_order_whatever_the_network_does(seed,
     assert finished, told
     assert robot.broken == [] and hub.broken == [], told
     assert max(sizes) <= 1200, told
+    assert balance.worst <= 0, told
     assert hub.stored["robot_1"] == sent, told
     assert hub.most_early <= limits.max_early + 3 * RESERVED_SEGMENTS, told
 
@@ -98,12 +128,11 @@ def test_without_faults_nothing_is_sent_twice():
     for end in (robot.client, hub.server):
         counted = end.statistics()
         assert not any(counted[what] for what in ("packets_lost", "retransmitted", "duplicates", *Drop))
-    network.run(lambda: False, limit=1.0)
+    network.run(lambda: False, limit=0.5)
     assert hub.server.statistics()["early"] == 0  # given back while the session lives, not at its end
-    [connection] = hub.server._connections.values()
-    for session in (robot.client._session, connection.session):
-        assert session.round_trip.smoothed == pytest.approx(0.02, rel=0.5)
-        assert session.waiting_since == NEVER and not session._unacked and not session._early and not session._unsent
+    sending = robot.client._session.sending
+    assert sending._round_trip.smoothed == pytest.approx(0.02, rel=0.5)
+    assert sending.oldest == NEVER and not sending._segments and not sending._unsent and not sending._carrier
 
 
 def test_reordering_within_an_eighth_of_the_round_trip_is_not_taken_for_loss():
@@ -120,7 +149,7 @@ def test_datagrams_are_filled_to_the_last_byte_and_no_further():
         ServerProgram(network)
         robot = RobotProgram(network, [])
         assert network.run(lambda robot=robot: robot.sent is not None)
-        network.run(lambda: False, limit=1.0)
+        network.run(lambda: False, limit=0.5)
         robot.client.send(bytes(size))
         sizes = [len(data) for data, _ in robot.client.datagrams_to_send(network.now)]
         assert len(sizes) == count and sizes[0] == 1200
@@ -132,7 +161,7 @@ def test_many_small_messages_share_datagrams():
     robot = RobotProgram(network, [bytes(316)] * 600)
     assert network.run(lambda: robot.done)
     sent = robot.client.statistics()
-    assert sent["datagrams_sent"] < 600 / 3 + 600 / 8 + 20  # three to a datagram, and acknowledgements
+    assert sent["datagrams_sent"] < 600 / 3 + 20  # three to a datagram
 
 
 def test_many_robots_keep_their_messages_apart():
@@ -156,15 +185,18 @@ def test_many_robots_keep_their_messages_apart():
 # How long things take
 
 
-@pytest.mark.parametrize(("loss", "median", "most"), [(0.0, 0.15, 0.15), (0.2, 0.5, 2.0), (0.3, 0.9, 3.5)])
-def test_a_session_comes_about_soon_though_datagrams_are_lost(loss, median, most):
-    """Four one-way trips of 20 ms and two flights of two datagrams; the first edition took 3.9 s at 20 %."""
+@pytest.mark.parametrize(
+    ("round_trip", "loss", "median", "most"),
+    [(0.04, 0.0, 0.121, 0.121), (0.04, 0.2, 0.4, 1.2), (0.04, 0.3, 0.6, 3.0), (0.6, 0.3, 3.2, 11.0)],
+)
+def test_the_first_chunk_can_be_sent_soon_though_datagrams_are_lost(round_trip, loss, median, most):
+    """Three round trips without loss. The second edition took four, and 4.3 s in the median of the last case."""
     times = []
     for seed in range(60):
-        network = Network(seed, Faults(loss=loss, delay=0.02))
+        network = Network(seed, Faults(loss=loss, delay=round_trip / 2))
         ServerProgram(network)
         robot = RobotProgram(network, [])
-        assert network.run(lambda robot=robot: bool(robot.events))
+        assert network.run(lambda robot=robot: robot.sent is not None)
         times.append(network.now - 1000.0)
     assert statistics.median(times) <= median
     assert statistics.quantiles(times, n=20)[-1] <= most
@@ -191,7 +223,7 @@ def test_a_narrow_link_is_filled_without_loss_and_without_a_long_queue():
     network.run(lambda: False, limit=20.0)
     assert len(hub.stored["robot_1"]) * 8000 / (network.now - began) > 85_000
     assert robot.client.statistics()["packets_lost"] < 30
-    assert robot.client._session.round_trip.smoothed < 0.04 + 0.15  # the queue would hold 0.6 s
+    assert robot.client._session.sending._round_trip.smoothed < 0.04 + 0.15  # the queue would hold 0.6 s
 
 
 def test_a_link_that_drops_instead_of_queueing_is_not_flooded():
@@ -208,7 +240,7 @@ def test_a_link_that_drops_instead_of_queueing_is_not_flooded():
 # Ends of sessions
 
 
-def test_a_restarted_server_says_nothing_and_robots_that_wait_return_after_their_patience():
+def test_a_restarted_server_says_nothing_and_robots_that_send_return_after_ten_seconds():
     network = Network(4, Faults(delay=0.02))
     hub = ServerProgram(network)
     robot = RobotProgram(network, messages(random.Random(1), 20))
@@ -219,36 +251,23 @@ def test_a_restarted_server_says_nothing_and_robots_that_wait_return_after_their
     began = network.now
     assert network.run(lambda: robot.done)
     assert [e.reason for e in robot.events if isinstance(e, Disconnected)] == [End.SILENT]
-    assert 10.0 <= network.now - began < 14.0
+    assert 10.0 <= network.now - began < 12.0
     assert hub.server.statistics()["handshakes"] == 1
 
 
-def test_a_robot_that_waits_for_nothing_notices_a_restart_within_its_ping_and_its_patience():
+def test_a_robot_that_waits_for_nothing_notices_a_restart_within_its_probe_and_the_silence():
     network = Network(4, Faults(delay=0.02))
     hub = ServerProgram(network)
     robot = RobotProgram(network, [b"one"])
     assert network.run(lambda: robot.done)
+    network.run(lambda: False, limit=100.0)
     hub.restart()
     began = network.now
     assert network.run(lambda: len(robot.events) == 3, limit=60.0)
-    assert 10.0 < network.now - began < 25.0
+    assert 10.0 < network.now - began < 22.0
 
 
-def test_a_robot_that_waits_for_an_answer_alone_notices_silence_too():
-    """Its message was acknowledged, nothing is in flight; the server dies before it answers."""
-    network = Network(4, Faults(delay=0.02))
-    hub = ServerProgram(network, commit_delay=3.0)
-    robot = RobotProgram(network, [b"one"])
-    assert network.run(lambda: robot.sent == 1)
-    network.run(lambda: False, limit=1.0)
-    assert robot.client._session.waiting_since == NEVER
-    hub.restart()
-    began = network.now
-    assert network.run(lambda: robot.done, limit=60.0)
-    assert network.now - began < 10.0 + 3.0 + 4.0
-
-
-def test_a_server_that_takes_long_to_answer_but_lives_keeps_its_robots():
+def test_a_server_that_takes_long_to_store_but_lives_keeps_its_robots():
     network = Network(4, Faults(delay=0.02, loss=0.1))
     hub = ServerProgram(network, commit_delay=40.0)
     robot = RobotProgram(network, [b"one"])
@@ -257,8 +276,8 @@ def test_a_server_that_takes_long_to_answer_but_lives_keeps_its_robots():
     assert hub.stored == {"robot_1": [b"one"]}
 
 
-def test_patience_doubles_to_a_minute_with_jitter_until_something_is_stored():
-    """Sessions come about and then nothing arrives: each waits longer than the one before."""
+def test_sessions_that_end_soon_are_made_anew_ever_more_slowly():
+    """Sessions come about and then nothing arrives any more; a long one begins the count again."""
     network = Network(5, Faults(delay=0.02))
     ServerProgram(network)
     robot = RobotProgram(network, [b"one"])
@@ -275,19 +294,103 @@ def test_patience_doubles_to_a_minute_with_jitter_until_something_is_stored():
         robot.on_event(event)
 
     robot.host.on_event = watch
-    network.run(lambda: len(lost) == 6, limit=600.0)
-    waits = [end - begin for begin, end in zip(connected, lost, strict=True)]
-    for wait, expected in zip(waits, (10, 20, 40, 60, 60, 60), strict=True):
-        assert expected <= wait <= expected * 1.25 + 0.5
-    assert len({round(wait / 60, 3) for wait in waits[3:]}) == 3  # by chance, not all at once
+    network.run(lambda: len(lost) == 9, limit=600.0)
+    waits = [begin - end for begin, end in zip(connected[1:], lost, strict=False)]
+    for wait, expected in zip(waits, (0.5, 1, 2, 4, 8, 10, 10, 10), strict=True):
+        assert expected / 2 <= wait - 0.12 <= expected
+    assert len({round(wait, 3) for wait in waits[5:]}) == 3  # by chance, not all at once
     robot.host.on_event = robot.on_event
+    network.run(lambda: False, limit=100.0)
+    robot.client._end(End.SILENT, network.now)
+    assert robot.client._failures == 0
+
+
+def test_a_fleet_is_back_soon_after_a_restart_though_handshakes_take_long():
+    """Robots that wait for the server's time repeat their PROOF; nobody is kept out by the others."""
+    network = Network(9, Faults(delay=0.02, jitter=0.01))
+    clock = iter(range(10**9))
+    hub = ServerProgram(network)
+    robots = [
+        RobotProgram(network, [b"x"], who=enrolled(f"robot_{i}"), address=("198.51.100.7", 50000 + i))
+        for i in range(40)
+    ]
+    hub.host.endpoint._stopwatch = lambda: next(clock) * 0.1  # 40 of them at half of the time: 8 s
+    assert network.run(lambda: all(r.done for r in robots), limit=60.0)
+    assert network.now - 1000.0 < 25.0
+    assert hub.server.statistics()["handshakes"] == 40
+
+
+# The state: a level
+
+
+def test_a_state_that_was_lost_is_told_by_a_probe():
+    """It changes at the server alone, as when a block is confirmed; the packet that says so is lost."""
+    network = Network(3, Faults(delay=0.02))
+    hub = ServerProgram(network)
+    robot = RobotProgram(network, [b"one"])
     assert network.run(lambda: robot.done)
-    assert robot.client._silences == 0
-    assert robot.client._patience == 10.0
+    [connection] = hub.names
+    network.faults = Faults(loss=1.0)
+    hub.server.set_state(connection, b"the newest")
+    network.settle()
+    network.faults = Faults(delay=0.02)
+    heard: list[object] = []
+    robot.host.on_event = lambda event: heard.append((round(network.now, 2), event))
+    began = network.now
+    assert network.run(lambda: bool(heard), limit=5.0)
+    [(when, event)] = heard
+    assert event == State(b"the newest") and when - began < 1.1
+
+
+def test_a_quiet_session_is_probed_after_one_second_then_two_up_to_ten():
+    network = Network(3, Faults(delay=0.02))
+    ServerProgram(network)
+    robot = RobotProgram(network, [])
+    assert network.run(lambda: robot.sent is not None)
+    sent: list[float] = []
+    network.watch = lambda data, source, target: sent.append(network.now) if target == SERVER_ADDRESS else None
+    robot.messages.append(b"the last")
+    robot.feed()
+    network.run(lambda: False, limit=60.0)
+    pauses = [b - a for a, b in pairwise(sent)]
+    assert [round(pause) for pause in pauses] == [1, 2, 4, 8, 10, 10, 10, 10]
+
+
+def test_a_state_is_told_once_and_only_the_newest():
+    network = Network(3, Faults(delay=0.02))
+    hub = ServerProgram(network)
+    robot = RobotProgram(network, [])
+    assert network.run(lambda: robot.sent is not None)
+    [connection] = hub.names
+    heard: list[object] = []
+    robot.host.on_event = heard.append
+    for number in range(5):
+        hub.server.set_state(connection, b"%d" % number)
+    network.run(lambda: False, limit=30.0)
+    assert heard == [State(b"4")]  # though every probe is answered with it
+
+
+def test_a_state_that_comes_late_is_not_taken_for_the_newest():
+    network = Network(3, Faults(delay=0.02))
+    hub = ServerProgram(network)
+    robot = RobotProgram(network, [])
+    assert network.run(lambda: robot.sent is not None)
+    [connection] = hub.names
+    held = []
+    for state in (b"older", b"newer"):
+        hub.server.set_state(connection, state)
+        held += hub.server.datagrams_to_send(network.now)
+    heard: list[object] = []
+    robot.host.on_event = heard.append
+    for data, _ in reversed(held):
+        robot.client.receive_datagram(data, SERVER_ADDRESS, network.now)
+    network.settle()
+    assert heard == [State(b"newer")]
 
 
 def test_a_session_ends_after_its_packets_or_its_time_and_the_next_one_follows_at_once(monkeypatch):
-    monkeypatch.setattr("rosbridge_eth.channel.session.SESSION_PACKETS", 100)
+    for end in ("client", "server"):
+        monkeypatch.setattr(f"rosbridge_eth.channel.{end}.SESSION_PACKETS", 100)
     network = Network(8, Faults(delay=0.02))
     hub = ServerProgram(network)
     robot = RobotProgram(network, [bytes(1000)] * 300)
@@ -347,7 +450,7 @@ def test_a_robot_whose_address_changes_keeps_its_session():
     assert network.now - began < 0.3  # no waiting for a timeout of seconds
     network.run(lambda: False, limit=1.0)
     assert hub.server.statistics()["address_changes"] == 1
-    assert [hub.server.address_of(c) for c in hub.server._connections] == [("203.0.113.5", 40000)]
+    assert [hub.server.address_of(c) for c in hub.server._sessions] == [("203.0.113.5", 40000)]
     assert not [e for e in robot.events if isinstance(e, Disconnected)]
 
 
@@ -367,7 +470,7 @@ def test_after_an_outage_what_waited_does_not_come_as_a_flood():
     ServerProgram(network)
     robot = RobotProgram(network, [bytes(1000)] * 200)
     assert network.run(lambda: robot.done)
-    before = robot.client._session._window.size
+    before = robot.client._session.sending._window.size
     network.faults = Faults(loss=1.0)
     robot.messages += [bytes(1000)] * 2000
     robot.feed()
@@ -397,7 +500,7 @@ def test_an_idle_session_is_kept_alive_and_a_dead_robot_is_forgotten():
     assert hub.server.statistics()["connections"] == 1
     before = robot.client.statistics()["datagrams_sent"]
     network.run(lambda: False, limit=100.0)
-    assert robot.client.statistics()["datagrams_sent"] - before <= 12  # one ping in ten seconds
+    assert robot.client.statistics()["datagrams_sent"] - before <= 12  # one probe in ten seconds
     network.hosts.remove(robot.host)
     network.run(lambda: False, limit=60.0)
     assert hub.server.statistics().items() >= {("connections", 0)}  # said: a gauge that is not set stays as it was
@@ -417,7 +520,7 @@ def test_two_machines_with_one_identity_do_not_take_turns_all_the_time():
 
 
 def test_a_sender_is_told_to_wait_and_holds_no_more_than_it_may(monkeypatch):
-    monkeypatch.setattr("rosbridge_eth.channel.session.MAX_BUFFERED", 100_000)
+    monkeypatch.setattr("rosbridge_eth.channel.transfer.BUFFER", 100_000)
     network = Network(11, Faults(delay=0.02))
     ServerProgram(network)
     robot = RobotProgram(network, [])
@@ -425,5 +528,5 @@ def test_a_sender_is_told_to_wait_and_holds_no_more_than_it_may(monkeypatch):
     robot.messages = [bytes(9996)] * 50
     robot.feed()
     assert 8 <= robot.sent <= 9
-    assert not robot.client.writable() and robot.client.writable(1)
+    assert 1 <= robot.client.room() < 10_000
     assert network.run(lambda: robot.done)

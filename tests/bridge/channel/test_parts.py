@@ -1,21 +1,23 @@
-"""The parts under the channel, each against a plain model: windows, acknowledgements, frames, buckets."""
+"""The parts under the channel, each against a plain model: windows, answers, streams, buckets."""
 
 from __future__ import annotations
 
 import random
 import tracemalloc
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.channel.steps import Steps, events
-from rosbridge_eth.channel import Message
-from rosbridge_eth.channel.admission import Cookies, Sources, TokenBucket
+from rosbridge_eth.channel import Drop, Message
+from rosbridge_eth.channel.admission import Cookies, TokenBucket
 from rosbridge_eth.channel.delivery import GAIN, INITIAL_WINDOW, MINIMUM_WINDOW, QUEUE_SHARE, RoundTrip, Window
+from rosbridge_eth.channel.events import Refused
 from rosbridge_eth.channel.protection import Direction, ReplayWindow
-from rosbridge_eth.channel.wire import ACK_BITS, Ack, Hello, Malformed, Mode, fields, parse_fields
-from smcrypto import InvalidTag
+from rosbridge_eth.channel.transfer import Early, Receiving
+from rosbridge_eth.channel.wire import ACK_BITS, MAX_STATE, Answer, Hello, Malformed, Mode, fields, parse_fields
 
 
 @given(st.lists(st.integers(0, 5000), max_size=300))
@@ -41,38 +43,54 @@ def test_the_replay_window_is_at_least_1024_wide_and_does_not_grow():
     assert window.bits.bit_length() <= window.size
 
 
-@given(st.lists(st.integers(0, 2000), min_size=1, max_size=150))
-def test_acknowledged_is_what_was_received_and_nothing_else(numbers):
+@given(st.lists(st.integers(0, 2000), min_size=1, max_size=150), st.binary(max_size=MAX_STATE))
+def test_acknowledged_is_what_was_received_and_nothing_else(numbers, state):
     window = ReplayWindow()
     for number in numbers:
         window.mark(number)
-    frame = Ack(window.highest, 3, window.bits).to_bytes()
-    ack, behind = Ack.parse(frame + b"behind")
-    assert behind == b"behind"
-    told = {ack.largest - i for i in range(ack.bits.bit_length()) if ack.bits >> i & 1}
+    answer = Answer.parse(Answer(window.highest, 3, 10**12, window.bits, state).to_bytes())
+    assert answer.data == state
+    told = {answer.largest - i for i in range(answer.bits.bit_length()) if answer.bits >> i & 1}
     assert told == {n for n in numbers if n > max(numbers) - ACK_BITS}
-    assert ack.next_segment == 3
+    assert (answer.next_segment, answer.time_ms) == (3, 10**12)
 
 
-@given(st.binary(max_size=100))
-def test_any_bytes_are_an_acknowledgement_or_malformed(data):
+@given(st.binary(max_size=800))
+def test_any_bytes_are_an_answer_or_malformed(data):
     try:
-        ack, behind = Ack.parse(b"\x02" + data)
+        answer = Answer.parse(b"\x03" + data)
     except Malformed:
         return
-    assert data.endswith(behind)
-    assert ack.bits & 1 and ack.bits.bit_length() <= min(ack.largest + 1, ACK_BITS)
+    assert data.endswith(answer.data) and len(answer.data) <= MAX_STATE
+    assert answer.bits & 1 and answer.bits.bit_length() <= min(answer.largest + 1, ACK_BITS)
 
 
 @given(st.lists(st.binary(max_size=60), max_size=9), st.binary(min_size=1, max_size=3))
-def test_fields_come_back_and_nothing_may_follow(parts, more):
+def test_fields_come_back_and_nothing_but_zeros_may_follow(parts, more):
     body = fields(parts)
-    assert parse_fields(body, len(parts))[0] == parts
-    with pytest.raises(Malformed):
-        parse_fields(body + more, len(parts))
+    assert parse_fields(body, len(parts))[0] == parse_fields(body + bytes(7), len(parts))[0] == parts
+    if any(more):
+        with pytest.raises(Malformed):
+            parse_fields(body + more, len(parts))
     if parts:
         with pytest.raises(Malformed):
             parse_fields(body[:-1], len(parts))
+
+
+@given(st.lists(st.binary(max_size=1300), max_size=40), st.randoms())
+def test_messages_are_cut_out_of_any_segments_and_segments_come_in_any_order(payloads, draw):
+    stream = b"".join(len(payload).to_bytes(4, "big") + payload for payload in payloads)
+    cuts = sorted({0, len(stream), *(draw.randrange(len(stream) + 1) for _ in range(20))})
+    numbered = [*enumerate(stream[a:b] for a, b in pairwise(cuts))]
+    draw.shuffle(numbered)
+    early = Early(1000)
+    receiving = Receiving(early)
+    for index, data in numbered:
+        assert not receiving.known(index)
+        assert receiving.take(index, data)
+        assert receiving.known(index)
+    assert receiving.messages == payloads
+    assert early.kept == 0
 
 
 def rounds(window: Window, rtt: float, delivered: float, count: int = 1, now: float = 1.0) -> int:
@@ -164,16 +182,6 @@ def test_a_cookie_is_for_one_address_hello_and_time():
     assert not Cookies(b"\1" * 32, 20.0).holds(cookie, place, hello, 100.0)
 
 
-def test_sources_are_few_and_an_ipv6_network_is_one():
-    sources = Sources(1.0, 3.0, 10)
-    for i in range(1000):
-        sources.take((f"10.0.{i // 256}.{i % 256}", 1), 0.0)
-    assert len(sources) == 10
-    taken = [sources.take((f"2001:db8::{i:x}", 1), 0.0) for i in range(6)]
-    assert taken == [True] * 3 + [False] * 3
-    assert sources.take(("2001:db8:0:1::1", 1), 0.0)
-
-
 def test_a_bucket_never_holds_more_than_its_burst():
     bucket = TokenBucket(10.0, 5.0, 0.0)
     assert bucket.available(1000.0) == 5.0
@@ -187,27 +195,29 @@ def test_a_packet_opens_under_its_key_its_number_and_its_header_only():
     keys = Direction(b"s" * 32)
     packet = keys.seal(b"12345678", 7, b"frames")
     assert packet[:13] == b"\x4012345678" + (7).to_bytes(4, "big")
-    assert Direction(b"s" * 32).open(packet, 7) == b"frames"
-    for other, data, number in (
-        (Direction(b"t" * 32), packet, 7),
-        (keys, packet, 8),
-        (keys, b"\x41" + packet[1:], 7),
-        (keys, packet[:5] + b"x" + packet[6:], 7),
+    assert Direction(b"s" * 32).open(packet, ReplayWindow()) == (7, b"frames")
+    seen = ReplayWindow()
+    seen.mark(7)
+    for other, data, replay, drop in (
+        (Direction(b"t" * 32), packet, ReplayWindow(), Drop.TAG),
+        (keys, packet[:12] + b"\x08" + packet[13:], ReplayWindow(), Drop.TAG),
+        (keys, b"\x41" + packet[1:], ReplayWindow(), Drop.TAG),
+        (keys, packet[:5] + b"x" + packet[6:], ReplayWindow(), Drop.TAG),
+        (keys, packet, seen, Drop.REPLAYED),
     ):
-        with pytest.raises(InvalidTag):
-            other.open(data, number)
+        with pytest.raises(Refused) as refused:
+            other.open(data, replay)
+        assert refused.value.drop is drop
 
 
 def test_noise_to_either_end_changes_nothing():
     draw = random.Random(11)
     steps = Steps().until_connected()
-    session = steps.client._session
     for _ in range(3000):
         kind = draw.choice((1, 2, 3, 4, 5, 6, 0x40, 0x40, draw.randrange(256)))
-        cid = draw.choice((session.cid, steps.client._cid, draw.randbytes(8)))
+        cid = draw.choice((steps.connection, steps.client._cid, draw.randbytes(8)))
         data = bytes((kind,)) + draw.choice((b"", b"\1", cid, b"\1" + cid)) + draw.randbytes(draw.randrange(0, 1300))
         steps.to_server(data)
         steps.to_client(data)
-    steps.client.send(b"still here")
-    steps.to_server(*(d for d, _ in steps.client.datagrams_to_send(steps.now)))
+    steps.to_server(*steps.sent(b"still here"))
     assert [e.payload for e in events(steps.server) if isinstance(e, Message)] == [b"still here"]

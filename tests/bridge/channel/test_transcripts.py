@@ -16,8 +16,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from rosbridge_eth.channel.protection import Direction, SessionSecrets
-from rosbridge_eth.channel.wire import Mode
+from rosbridge_eth.channel.protection import Direction, ReplayWindow, SessionSecrets
+from rosbridge_eth.channel.wire import PROBE, Answer, Mode
 from rosbridge_eth.identity import Role
 from smcrypto import sm2
 
@@ -147,18 +147,20 @@ def gcm_open(key: bytes, nonce: bytes, data: bytes, header: bytes) -> bytes:
 
 
 def packet(secret: bytes, data: bytes) -> bytes:
-    keys = hkdf(secret, 28, b"", b"rosbridge-eth/2 packets")
+    keys = hkdf(secret, 28, b"", b"rosbridge-eth/3 packets")
     number = int.from_bytes(data[9:13], "big")
     nonce = (int.from_bytes(keys[16:28], "big") ^ number).to_bytes(12, "big")
     return gcm_open(keys[:16], nonce, data[13:], data[:13])
 
 
-def split(body: bytes) -> list[bytes]:
+def split(body: bytes, count: int) -> list[bytes]:
+    """So many fields, then nothing but zeros."""
     found = []
-    while body:
+    for _ in range(count):
         length = int.from_bytes(body[:2], "big")
         found.append(body[2 : 2 + length])
         body = body[2 + length :]
+    assert not any(body)
     return found
 
 
@@ -166,8 +168,8 @@ def joined(*parts: bytes) -> bytes:
     return b"".join(len(part).to_bytes(2, "big") + part for part in parts)
 
 
-def shared_secret(v, client_id: bytes, server_id: bytes, r_a: bytes, r_b: bytes):
-    """GB/T 32918.3-2016, 6.1, from A's side: K, S_B, S_A."""
+def shared_secret(v, client_id: bytes, server_id: bytes, r_a: bytes, r_b: bytes) -> bytes:
+    """GB/T 32918.3-2016, 6.1, from A's side: K."""
     d_a, r = int.from_bytes(v.client_encryption_key, "big"), int.from_bytes(v.client_ephemeral_key, "big")
     p_a, p_b = times(d_a, G), times(int.from_bytes(v.server_encryption_key, "big"), G)
     ra, rb = point(r_a), point(r_b)
@@ -176,67 +178,57 @@ def shared_secret(v, client_id: bytes, server_id: bytes, r_a: bytes, r_b: bytes)
     w = 2**127
     x1, x2 = w + (ra[0] & (w - 1)), w + (rb[0] & (w - 1))
     u = times((d_a + x1 * r) % N, add(p_b, times(x2, rb)))
-    z_a, z_b = z(client_id, p_a), z(server_id, p_b)
-    k = kdf(b32(u[0]) + b32(u[1]) + z_a + z_b, 32)
-    inner = sm3(b32(u[0]), z_a, z_b, b32(ra[0]), b32(ra[1]), b32(rb[0]), b32(rb[1]))
-    return k, sm3(b"\x02", b32(u[1]), inner), sm3(b"\x03", b32(u[1]), inner)
+    return kdf(b32(u[0]) + b32(u[1]) + z(client_id, p_a) + z(server_id, p_b), 32)
 
 
 @case
 def test_the_transcript_follows_from_the_documents(v):
     mode = {"exchange": 1, "transport": 2}[v.mode]
-    assert v.hello[:3] == bytes((1, 2, mode)) and len(v.hello) == 1200 and not any(v.hello[27:])
+    assert v.hello[:3] == bytes((1, 3, mode)) and len(v.hello) == 1200 and not any(v.hello[27:])
     client_cid, nonce = v.hello[3:11], v.hello[11:27]
     assert v.cookie[:27] == b"\x02" + v.hello[1:27]
     cookie = v.cookie[27:]
     for index, data in enumerate(v.proof):
-        assert data[:53] == b"\x03" + v.hello[1:27] + cookie + bytes((index, len(v.proof)))
+        assert data[:53] == b"\x03" + v.hello[1:27] + cookie + bytes((index, len(v.proof))) and len(data) == 1200
     for index, data in enumerate(v.offer):
         assert data[:29] == b"\x04" + v.hello[1:27] + bytes((index, len(v.offer)))
-    proof = split(b"".join(data[53:] for data in v.proof))
-    offer = split(b"".join(data[29:] for data in v.offer))
-    assert (len(proof), len(offer)) == (4, 8)
-    client_sign, client_enc, r_a, client_signature = proof
-    server_nonce, server_cid, server_sign, server_enc, material, server_signature, s_b, server_finished = offer
-    assert len(server_nonce) == 16 and server_cid[0] == 0
+    assert sum(map(len, v.offer)) <= sum(map(len, v.proof))
+    client_sign, client_enc, r_a, client_signature = split(b"".join(data[53:] for data in v.proof), 4)
+    offer = split(b"".join(data[29:] for data in v.offer), 7)
+    server_nonce, server_cid, server_sign, server_enc, material, server_signature, finished = offer
+    assert (len(server_nonce), len(server_cid), len(finished)) == (16, 8, 32)
     assert v.client_signing_public in client_sign and v.server_signing_public in server_sign
 
-    so_far = b"rosbridge-eth/2 handshake\0" + bytes((2, mode)) + client_cid + nonce + cookie
+    so_far = b"rosbridge-eth/3 handshake\0" + bytes((3, mode)) + client_cid + nonce + cookie
     so_far += joined(client_sign, client_enc, r_a)
     purpose = b"rosbridge-eth/2 handshake\0"
     check_signature(point(v.client_signing_public), purpose + b"client" + sm3(so_far), client_signature)
     so_far += joined(client_signature, server_nonce, server_cid, server_sign, server_enc, material)
     check_signature(point(v.server_signing_public), purpose + b"server" + sm3(so_far), server_signature)
-    so_far += joined(server_signature, s_b)
+    so_far += joined(server_signature)
     h3 = sm3(so_far)
     assert h3 == v.h3
 
-    s_a = bytes(32)
     if v.mode == "exchange":
-        k, expected_s_b, s_a = shared_secret(
-            v, b"robot" + sm3(client_enc), b"server" + sm3(server_enc), r_a, material
-        )
-        assert k == v.shared and s_b == expected_s_b
+        assert shared_secret(v, b"robot" + sm3(client_enc), b"server" + sm3(server_enc), r_a, material) == v.shared
     else:
-        assert r_a == b"" and s_b == b""
+        assert r_a == b""
         assert sm2.PrivateKey.from_bytes(v.client_encryption_key).decrypt(material) == v.shared
 
-    secrets = hkdf(v.shared, 128, h3, b"rosbridge-eth/2 session " + v.mode.encode())
-    client, server, client_finished, server_finish = (secrets[i : i + 32] for i in range(0, 128, 32))
+    secrets = hkdf(v.shared, 96, h3, b"rosbridge-eth/3 session " + v.mode.encode())
+    client, server, finish = (secrets[i : i + 32] for i in range(0, 96, 32))
     assert (client, server) == (v.client_secret, v.server_secret)
-    assert server_finished == mac(server_finish, h3)
-    h4 = sm3(so_far + joined(server_finished))
-    assert v.finished[:13] == b"\x40" + server_cid + bytes(4)
-    first = b"\x03" + bytes(4)
-    assert packet(client, v.finished) == first + (64).to_bytes(4, "big") + s_a + mac(client_finished, h4)
-    [accepted] = v.accepted
-    assert accepted[1:9] == client_cid
-    acknowledgement = b"\x02" + bytes(4) + (1).to_bytes(4, "big") + b"\1\1"
-    time = packet(server, accepted).removeprefix(acknowledgement).removeprefix(first + (8).to_bytes(4, "big"))
-    assert int.from_bytes(time, "big") == v.server_time_ms
-    message = packet(client, v.message)
+    assert finished == mac(finish, h3)
+
+    assert v.first[:13] == b"\x40" + server_cid + bytes(4)
+    assert packet(client, v.first) == b"\x02".ljust(18 + 64 + 600, b"\0")
+    came = bytes(4) + bytes(4) + v.server_time_ms.to_bytes(8, "big") + b"\1\1"  # packet 0, no segment
+    for number, (data, state) in enumerate(((v.answer[0], b""), (v.state, v.state_data))):
+        assert data[:13] == b"\x40" + client_cid + number.to_bytes(4, "big")
+        assert packet(server, data) == b"\x03" + came + state
     length = len(v.message_payload).to_bytes(4, "big")
-    assert message.endswith(b"\x03" + (1).to_bytes(4, "big") + length + v.message_payload)
+    assert v.message[9:13] == (1).to_bytes(4, "big")
+    assert packet(client, v.message) == b"\x01" + bytes(4) + length + v.message_payload
 
 
 @case
@@ -245,12 +237,13 @@ def test_our_functions_give_the_recorded_values(v):
 
     secrets = SessionSecrets(v.shared, v.h3, Mode[v.mode.upper()])
     assert (secrets.client, secrets.server) == (v.client_secret, v.server_secret)
-    assert Direction(v.client_secret).open(v.finished, 0)[0] == 3
-    number = int.from_bytes(v.message[9:13], "big")
-    assert Direction(v.client_secret).open(v.message, number).endswith(v.message_payload)
+    assert Direction(v.client_secret).open(v.first, ReplayWindow()) == (0, PROBE)
+    assert Direction(v.client_secret).open(v.message, ReplayWindow())[1].endswith(v.message_payload)
+    answer = Answer.parse(Direction(v.server_secret).open(v.state, ReplayWindow())[1])
+    assert (answer.data, answer.time_ms, answer.largest, answer.bits) == (v.state_data, v.server_time_ms, 0, 1)
     if v.mode == "exchange":
-        proof = split(b"".join(data[53:] for data in v.proof))
-        offer = split(b"".join(data[29:] for data in v.offer))
+        proof = split(b"".join(data[53:] for data in v.proof), 4)
+        offer = split(b"".join(data[29:] for data in v.offer), 7)
         exchange = sm2.KeyExchange(
             sm2.PrivateKey.from_bytes(v.server_encryption_key),
             exchange_id(Role.SERVER, offer[3]),
@@ -259,4 +252,4 @@ def test_our_functions_give_the_recorded_values(v):
             initiator=False,
             ephemeral_key=sm2.PrivateKey.from_bytes(v.server_ephemeral_key),
         )
-        assert exchange.agree(proof[2], 32) == (v.shared, offer[6])
+        assert exchange.agree(proof[2], 32, unconfirmed=True)[0] == v.shared

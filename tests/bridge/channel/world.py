@@ -1,6 +1,6 @@
 """Robots and a server on the simulated network, with the program that each end would run.
 
-`RobotProgram` has messages to be stored: at each session it asks what the server has of them, and sends what follows.
+`RobotProgram` has messages to be stored: in each session it sends what follows those that the server's state names.
 `ServerProgram` stores after a while and then says so; what it stored survives its restarts, what it only heard does
 not. Both write down whatever a promise of the channel forbids.
 """
@@ -21,6 +21,7 @@ from rosbridge_eth.channel import (
     Message,
     Server,
     ServerConfig,
+    State,
     cookie_key,
 )
 
@@ -83,14 +84,16 @@ def make_client(
 
 
 class ServerProgram:
-    """Messages up: `?`, or a number and what is to be stored. Down: how many are stored, after each of them."""
+    """Messages up: a number, and what is to be stored. State down: how many are stored, then `more`."""
 
     def __init__(self, network: Network, config: ServerConfig | None = None, commit_delay: float = 0.0) -> None:
         self.network = network
         self.config = config
         self.commit_delay = commit_delay
         self.stored: dict[str, list[bytes]] = {}
+        self.names: dict[bytes, str] = {}
         self.next: dict[bytes, int] = {}
+        self.more = bytes(117)  # the hop's state has 121 bytes without a reason
         self.events: list[Event] = []
         self.broken: list[str] = []
         self.most_early = 0
@@ -111,16 +114,14 @@ class ServerProgram:
         self.most_early = max(self.most_early, self.server.statistics()["early"])
         if not isinstance(event, Message):
             self.events.append(event)
+            if isinstance(event, Connected):
+                self.names[event.connection] = event.peer.name
+                self.next[event.connection] = len(self.stored.setdefault(event.peer.name, []))
+                self.say(event.connection)
             return
-        stored = self.stored.setdefault(event.peer.name, [])
-        if event.payload == b"?":
-            if event.connection in self.next:
-                self.broken.append("a question was heard twice in a session")
-            self.next[event.connection] = len(stored)
-            self._say(event.connection, len(stored))
-            return
+        stored = self.stored[self.names[event.connection]]
         number = int.from_bytes(event.payload[:4], "big")
-        expected = self.next.get(event.connection, -1)
+        expected = self.next[event.connection]
         if number != expected:
             self.broken.append(f"message {number} came where {expected} was expected")
         self.next[event.connection] = number + 1
@@ -131,16 +132,16 @@ class ServerProgram:
                 return  # this process died before its commit
             if number == len(stored):
                 stored.append(event.payload[4:])
-            self._say(event.connection, len(stored))
+            self.say(event.connection)
 
         if self.commit_delay:
             self.network.at(self.network.now + self.commit_delay, commit)
         else:
             commit()
 
-    def _say(self, connection: bytes, count: int) -> None:
-        if self.server.writable(connection, 4):
-            self.server.send(connection, count.to_bytes(4, "big"))
+    def say(self, connection: bytes) -> None:
+        count = len(self.stored[self.names[connection]])
+        self.server.set_state(connection, count.to_bytes(4, "big") + self.more)
 
 
 class RobotProgram:
@@ -184,33 +185,24 @@ class RobotProgram:
         """Send what the session takes."""
         while self.sent is not None and self.sent < len(self.messages):
             payload = self.sent.to_bytes(4, "big") + self.messages[self.sent]
-            if not self.client.writable(len(payload)):
+            if not self.client.connected or self.client.room() < len(payload):
                 break
             self.client.send(payload)
-            self.client.expecting(True)
             self.sent += 1
 
     def on_event(self, event: Event) -> None:
         match event:
-            case Message(payload=payload):
-                stored = int.from_bytes(payload, "big")
+            case State(data=data):
+                stored = int.from_bytes(data[:4], "big")
                 if self.sent is None:
                     self.sent = self.session_stored = stored
                 if stored < self.session_stored:
                     self.broken.append(f"{stored} came after {self.session_stored}")
                 self.stored = self.session_stored = stored
-                self.client.progressed()
-                self.client.expecting(stored < self.sent)
-            case Connected():
-                self.sent = None
-                self.client.send(b"?")
-                self.client.expecting(True)
-                self.events.append(event)
-            case Disconnected():
-                self.sent = None
-                self.events.append(event)
             case _:
                 self.events.append(event)
+                if isinstance(event, Connected | Disconnected):
+                    self.sent = None
         self.feed()
 
     @property

@@ -262,8 +262,13 @@ def test_one_to_sixteen_grants_are_a_header_and_others_are_not():
 
 # A robot that lies: the signature holds, the content does not
 
-FRAME = zstd.compress(b"a\n")
+FRAME = chunks._compressed(b"a\n", 9)
 SKIPPABLE = struct.pack("<II", 0x184D2A50, 4) + b"skip"
+
+
+def framed(content: bytes, level: int = 3) -> bytes:
+    """A frame of this content with the header of ours."""
+    return chunks._framed(zstd.compress(content, level), content)
 
 
 def streamed(content: bytes, window_log: int) -> bytes:
@@ -275,7 +280,7 @@ def streamed(content: bytes, window_log: int) -> bytes:
 def unended(content: bytes) -> bytes:
     """All blocks of a frame but the last; the zeros behind it are empty blocks."""
     packing = zstd.ZstdCompressor()
-    return packing.compress(content, packing.FLUSH_BLOCK)
+    return chunks._framed(packing.compress(content, packing.FLUSH_BLOCK), content)
 
 
 @pytest.mark.parametrize(
@@ -284,19 +289,20 @@ def unended(content: bytes) -> bytes:
         ("no zstd frame", {"frame": b"a\n"}), ("no zstd frame", {"frame": b"", "pad": 64}),
         ("no zstd frame", {"frame": SKIPPABLE + FRAME}), ("no zstd frame", {"frame": SKIPPABLE}),
         ("no zstd frame", {"frame": b"\x27\xb5\x2f\xfd" + FRAME[4:]}),
-        ("cannot be unpacked", {"frame": FRAME[:5] + b"\xff" * 20}),
-        ("cannot be unpacked", {"frame": streamed(b"a\n", 23)}),
+        ("no zstd frame", {"frame": zstd.compress(b"a\n")}), ("no zstd frame", {"frame": streamed(b"a\n", 22)}),
+        ("cannot be unpacked", {"frame": FRAME[:9] + b"\xff" * 20}),
+        ("cannot be unpacked", {"frame": FRAME[:5] + b"\3\0\0\0" + FRAME[9:]}),
         ("no end", {"frame": unended(b"a\n")}),
         ("more than one frame", {"frame": FRAME + FRAME}), ("more than one frame", {"frame": FRAME + SKIPPABLE}),
         ("more than one frame", {"frame": FRAME + b"\0\0\1"}),
         ("more than one frame", {"frame": FRAME, "pad": 128 - len(FRAME)}),
-        ("empty or has no end", {"frame": zstd.compress(b""), "records": 1}),
-        ("empty or has no end", {"frame": zstd.compress(b"a")}),
-        ("empty or has no end", {"frame": zstd.compress(b"\n"), "root": root_of([b""])}),
-        ("empty or has no end", {"frame": zstd.compress(b"\na\n"), "root": root_of([b"", b"a"]), "records": 2}),
-        ("empty or has no end", {"frame": zstd.compress(b"a\n\n"), "root": root_of([b"a", b""]), "records": 2}),
-        ("holds 1001 records", {"frame": zstd.compress(b"a\n" * (MAX_RECORDS + 1)), "records": MAX_RECORDS}),
-        ("holds 2 records", {"frame": zstd.compress(b"a\nb\n")}), ("holds 1 records", {"frame": FRAME, "records": 2}),
+        ("empty or has no end", {"frame": framed(b""), "records": 1}),
+        ("empty or has no end", {"frame": framed(b"a")}),
+        ("empty or has no end", {"frame": framed(b"\n"), "root": root_of([b""])}),
+        ("empty or has no end", {"frame": framed(b"\na\n"), "root": root_of([b"", b"a"]), "records": 2}),
+        ("empty or has no end", {"frame": framed(b"a\n\n"), "root": root_of([b"a", b""]), "records": 2}),
+        ("holds 1001 records", {"frame": framed(b"a\n" * (MAX_RECORDS + 1)), "records": MAX_RECORDS}),
+        ("holds 2 records", {"frame": framed(b"a\nb\n")}), ("holds 1 records", {"frame": FRAME, "records": 2}),
         ("root", {"frame": FRAME, "root": root_of([b"b"])}),
         ("root", {"frame": FRAME, "root": root_of([b"a"], b"j" * 16)}),
         ("does not open", {"frame": FRAME, "sealed_under": b"j" * 16}),
@@ -310,19 +316,27 @@ def test_what_the_robot_signed_and_cannot_be_opened_is_unopenable(why, what):
         opened(chunk)
 
 
-def test_a_frame_made_otherwise_is_taken_as_long_as_it_is_one():
-    for frame in (streamed(b"a\n", 22), streamed(b"a\n", 10), zstd.compress(b"a\n", 19), chunks._stored(b"a\n")):
+def test_blocks_made_otherwise_are_taken_as_long_as_the_header_is_the_one():
+    for frame in (framed(b"a\n", 1), framed(b"a\n", 19), chunks._framed(streamed(b"a\n", 22), b"a\n"),
+                  chunks._framed(streamed(b"a\n", 10), b"a\n"), chunks._stored(b"a\n")):  # fmt: skip
         assert opened(lying(frame, root=root_of([b"a"]))) == (b"a",)
 
 
+@pytest.mark.parametrize("size", [1, 255, 256, 65_791, 65_792, 262_144, MAX_PLAINTEXT])
+def test_every_size_has_the_one_header(size):
+    content = (b"a" * (size - 1)) + b"\n"
+    frame = chunks._compressed(content, 9)
+    assert frame[:9] == bytes.fromhex("28b52ffda0") + size.to_bytes(4, "little") and zstd.decompress(frame) == content
+
+
 def test_a_zip_bomb_is_unopenable_and_costs_no_memory():
-    bomb = streamed(b"a\n" * 2**26, 22)
+    bomb = chunks._framed(streamed(b"a\n" * 2**26, 22), b"a" * 1000)
     assert len(bomb) < MAX_BODY
-    claims = b"\x28\xb5\x2f\xfd\xe0" + (2**62).to_bytes(8, "little") + b"\x11\0\0a\n"  # 2^62 bytes, and has two
-    for frame in (bomb, zstd.compress(b"a" * (MAX_PLAINTEXT + 1)), zstd.compress(b"a\n" * 2**21), claims):
+    claims = b"\x28\xb5\x2f\xfd\xa0" + (2**32 - 1).to_bytes(4, "little") + b"\x11\0\0a\n"  # 4 GiB, and has two
+    for frame in (bomb, framed(b"a" * (MAX_PLAINTEXT + 1)), framed(b"a\n" * 2**21), claims):
         with pytest.raises(Unopenable):
             opened(lying(frame, records=MAX_RECORDS))
-    fits = zstd.compress(b"a" * (MAX_PLAINTEXT - 1) + b"\n")
+    fits = framed(b"a" * (MAX_PLAINTEXT - 1) + b"\n")
     assert len(opened(lying(fits, root=root_of([b"a" * (MAX_PLAINTEXT - 1)])))[0]) == MAX_PLAINTEXT - 1
 
 
@@ -388,9 +402,9 @@ def test_two_forks_with_the_same_random_bytes_never_encrypt_two_contents_under_o
         content_key(sealed(lines, number=number, randomness=lambda size: bytes(size), **more).header, READER)
         for lines in ([b"one"], [b"two"], [b"one", b"two"])
         for number in (0, 1)
-        for more in ({}, {"stream": b"s" * 16}, {"compress": False})
+        for more in ({}, {"stream": b"s" * 16})
     }
-    assert len(keys) == 18
+    assert len(keys) == 12
 
 
 def test_another_robot_log_or_randomness_is_another_key():

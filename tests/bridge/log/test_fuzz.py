@@ -10,7 +10,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from bridge.log.making import sealed
-from rosbridge_eth.log.chunk import zstd
 from rosbridge_eth.log.hop import ServerState, encode_offer
 
 PATH = Path(__file__).resolve().parents[3] / "fuzz" / "bridge_parsers.py"
@@ -25,8 +24,9 @@ CHUNK = parsers.chunks.seal(
 )  # fmt: skip
 PLACE, DIGEST = bytes(range(24)), bytes(range(32))
 INPUTS = [
-    CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, zstd.compress(b"one\ntwo\n") + bytes(20),
-    zstd.compress(b"one\n" + b"a" * 70_000 + b"\n"), encode_offer(CHUNK.encoded), encode_offer(CHUNK.encoded, DIGEST),
+    CHUNK.header.encoded, CHUNK.encoded, sealed([]).encoded, parsers.chunks._compressed(b"one\ntwo\n", 3) + bytes(20),
+    parsers.chunks._compressed(b"one\n" + b"a" * 70_000 + b"\n", 3), encode_offer(CHUNK.encoded),
+    encode_offer(CHUNK.encoded, DIGEST),
     ServerState().encode(), ServerState(PLACE, DIGEST, PLACE, 2, 255, DIGEST, "größer").encode(),
 ]  # fmt: skip
 

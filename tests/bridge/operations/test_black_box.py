@@ -75,7 +75,7 @@ def opened(home: RobotHome, text: str) -> Robot:
 
 
 def until_the_end(robot: Robot) -> None:
-    robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() and not robot._ring else None)
+    robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() and not robot._queue else None)
 
 
 def seen(home: RobotHome) -> dict[str, list[Any]]:
@@ -112,7 +112,7 @@ def test_an_event_after_the_end_of_a_bag_is_written_while_the_robot_waits_for_it
     streams: set[bytes] = set()
 
     def on_turn() -> None:
-        if running._unspooled or running.chunks == 0 or not running._source_ended.is_set() or running._ring:
+        if running._unspooled or running.chunks == 0 or not running._source_ended.is_set() or running._queue:
             return
         chunks = [Chunk.parse(running.spool.chunks([row.place])[0]) for row in running.spool.rows(NOWHERE, 10_000)]
         if chunks and chunks[-1].header.goodbye:

@@ -47,7 +47,7 @@ def opened(place: Place, text: str) -> Robot:
 
 
 def run_to_the_sources_end(robot: Robot) -> str:
-    robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() and not robot._ring else None)
+    robot.run(on_turn=lambda: robot.stop() if robot._source_ended.is_set() and not robot._queue else None)
     return robot.summary
 
 

@@ -81,6 +81,10 @@ def test_the_grant_opens_its_chunks(file: dict[str, Any]) -> None:
     ledger, trust = bytes.fromhex(file["ledger"]), Trust(read_certificates(file["ca"].encode()))
     robot, keys = open_grant(file["grant"].encode(), ledger=ledger, reader=who, trust=trust)
     assert {digest.hex(): one.hex() for digest, one in keys.items()} == file["keys"] and robot == file["robot"]
+    given = json.loads(file["grant"])
+    signature, by = bytes.fromhex(given.pop("signature")), identity.public_identity(given["by"].encode())
+    text = json.dumps(given, separators=(",", ":"), ensure_ascii=False).encode()  # docs/reading.md, Granting
+    by.signing_certificate.public_key.verify(signature, b"rosbridge-eth/2 grant\0" + text, encoding="raw")
     chunks = [Chunk.parse(bytes.fromhex(one)) for one in file["chunks"]]
     log = Log(ledger, robot_id(robot))
     assert all(len(open_lines(log, one, keys[one.header.digest])) == 2 for one in chunks[1:])

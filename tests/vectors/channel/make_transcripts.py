@@ -1,4 +1,4 @@
-"""Makes transcripts.json beside it: a whole handshake of each mode and a message, with every secret in them.
+"""Makes transcripts.json beside it: a whole handshake of each mode, a state and a message, with every secret.
 
 Run from the repository: PYTHONPATH=src:tests python tests/vectors/channel/make_transcripts.py
 
@@ -70,8 +70,10 @@ def transcript(mode: Mode) -> dict[str, Any]:
     (shared, digest), again = captured
     if (shared, digest) != again:
         raise RuntimeError("the two ends do not agree")
-    steps.client.send(b"the first message")
-    [(message, _)] = steps.client.datagrams_to_send(steps.now)
+    steps.server.set_state(steps.connection, b"the first state")
+    [state] = steps.to_server()
+    steps.to_client(state)
+    [message] = steps.sent(b"the first message")
     server_secrets = real(shared, digest, mode)
     return {
         "source": "rosbridge_eth, docs/channel.md",
@@ -88,8 +90,10 @@ def transcript(mode: Mode) -> dict[str, Any]:
         "cookie": steps.cookie.hex(),
         "proof": [data.hex() for data in steps.proof],
         "offer": [data.hex() for data in steps.offer],
-        "finished": steps.finished.hex(),
-        "accepted": [data.hex() for data in steps.accepted],
+        "first": steps.first.hex(),
+        "answer": [data.hex() for data in steps.answer],
+        "state": state.hex(),
+        "state_data": b"the first state".hex(),
         "message": message.hex(),
         "message_payload": b"the first message".hex(),
         "server_time_ms": int(wall().timestamp() * 1000),

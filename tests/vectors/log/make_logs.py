@@ -219,41 +219,45 @@ def frames() -> Iterator[tuple[str, str | None, bytes]]:
     good = message(1), message(2)
     content = b"\n".join([*good, b""])
 
+    def ours(data: bytes) -> bytes:
+        return chunks._compressed(data, 9)
+
     def streamed(data: bytes, **options: int) -> bytes:
         parameters = {int(getattr(zstd.CompressionParameter, name)): value for name, value in options.items()}
         packing = zstd.ZstdCompressor(options=parameters)
         return packing.compress(data) + packing.flush()
 
-    frame, checked = zstd.compress(content), streamed(content, checksum_flag=1)
-    skippable = struct.pack("<II", 0x184D2A50, 4) + b"skip"
+    frame, skippable = ours(content), struct.pack("<II", 0x184D2A50, 4) + b"skip"
     dictionary = zstd.train_dict([message(n, topic=f"/t{n % 7}") for n in range(2_000)], 4096)
     packing = zstd.ZstdCompressor()
     for name, made in (
         ("raw blocks", chunks._stored(content)),
-        ("without its size", streamed(content)),
-        ("a window of 4 MiB", streamed(content, window_log=22)),
-        ("a checksum", checked),
-        ("level 19", zstd.compress(content, 19)),
+        ("blocks of level 19", chunks._framed(zstd.compress(content, 19), content)),
+        ("blocks made for a window of 4 MiB", chunks._framed(streamed(content, window_log=22), content)),
     ):
         yield name, None, padded(made)
     for name, made in (
-        ("a window of 8 MiB", streamed(content, window_log=23)),
-        ("a wrong checksum", checked[:-1] + bytes([checked[-1] ^ 1])),
-        ("a dictionary", zstd.compress(content, zstd_dict=dictionary)),
-        ("another size", frame[:5] + b"\x01" + frame[6:]),
+        ("a header with a window", streamed(content)),
+        ("a header with a size of another length", zstd.compress(content)),
+        ("a checksum", streamed(content, checksum_flag=1)),
+        ("a reserved bit", frame[:4] + bytes([frame[4] | 8]) + frame[5:]),
+        ("a dictionary", chunks._framed(zstd.compress(content, zstd_dict=dictionary), content)),
+        ("a size too small", frame[:5] + b"\1\0\0\0" + frame[9:]),
+        ("a size too large", frame[:5] + (len(content) + 1).to_bytes(4, "little") + frame[9:]),
+        ("a size of 4 GiB", frame[:5] + b"\xff" * 4 + frame[9:]),
         ("no frame", content),
+        ("a header alone", frame[:9]),
         ("a skippable frame before it", skippable + frame),
         ("a skippable frame behind it", frame + skippable),
         ("two frames", frame * 2),
-        ("no last block", packing.compress(content, packing.FLUSH_BLOCK)),
-        ("more than 4 MiB", streamed(content + b"a" * (4 << 20) + b"\n")),
-        ("an empty record in front", zstd.compress(b"\n" + content)),
-        ("an empty record in the middle", zstd.compress(good[0] + b"\n\n" + good[1] + b"\n")),
-        ("a record without end", zstd.compress(content[:-1])),
-        ("a record too few", zstd.compress(good[0] + b"\n")),
-        ("a record too many", zstd.compress(content + good[0] + b"\n")),
-        ("a reserved bit", frame[:4] + bytes([frame[4] | 8]) + frame[5:]),
-        ("an extended window bit", b"\x28\xb5\x2f\xfd"),
+        ("no last block", chunks._framed(packing.compress(content, packing.FLUSH_BLOCK), content)),
+        ("a block of the reserved kind", frame[:9] + bytes([frame[9] | 6]) + frame[10:]),
+        ("more than 4 MiB", ours(content + b"a" * (4 << 20) + b"\n")),
+        ("an empty record in front", ours(b"\n" + content)),
+        ("an empty record in the middle", ours(good[0] + b"\n\n" + good[1] + b"\n")),
+        ("a record without end", ours(content[:-1])),
+        ("a record too few", ours(good[0] + b"\n")),
+        ("a record too many", ours(content + good[0] + b"\n")),
     ):
         yield name, "unopenable", padded(made)
     yield "padding that is not zero", "unopenable", padded(frame + b"\0\0\1")
@@ -495,6 +499,7 @@ def evidence_files() -> Iterator[dict[str, Any]]:
             encoded = (pen.drop(chunk) if bare else chunk).encoded
         values = {
             "robot": NAME,
+            "tk": LOG.tk,
             "chain_id": CHAIN_ID,
             "genesis": GENESIS,
             "contract": CONTRACT,
@@ -552,6 +557,9 @@ def evidence_files() -> Iterator[dict[str, Any]]:
         holds = b'"topic":"/odom"' in text
         yield case(f"a line: {text[:80].decode()}", holds, made(Pen(log=LOG), registered, texts=[message(1), text]))
     value = json.loads(good)
+    sealed = value["chunks"][0]["encoded"]
+    other = sealed[:-2] + ("00" if sealed[-2:] != "00" else "11")
+    yield case("a chunk: another body", False, good.replace(sealed, other))
     [written], [record] = value["chunks"], value["records"]
 
     def changed(**members: Any) -> str:
@@ -564,6 +572,7 @@ def evidence_files() -> Iterator[dict[str, Any]]:
         ("members in another order", json.dumps(dict(reversed(value.items())), separators=(",", ":"))),
         ("capitals", good.replace(written["encoded"], written["encoded"].upper())),
         ("another robot", changed(robot="robot_2")),
+        ("another Tk", changed(tk="11" * 32)),
         ("another chain", changed(chain_id=1)),
         ("another first block", changed(genesis="11" * 32)),
         ("another contract", changed(contract="11" * 20)),
@@ -586,7 +595,6 @@ def evidence_files() -> Iterator[dict[str, Any]]:
         ("a path too long", changed(records=[record | {"path": [*record["path"], "00" * 32]}])),
         ("a path the other way round", changed(records=[record | {"path": record["path"][::-1]}])),
         ("a node of the tree as a record", changed(records=[record | {"path": record["path"][1:]}])),
-        ("a hash of another chunk", changed(chunks=[written | {"hashes": ["00" * 32]}])),
         ("no hash", changed(chunks=[written | {"hashes": []}])),
         ("another index in the batch", changed(chunks=[written | {"first": 1}])),
         ("of no certificate", changed(chunks=[written | {"certificate": 1}])),

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from rosbridge_eth.config import RobotConfig
 
 Emit: TypeAlias = Callable[[RawMessage], None]
-"""Takes a message; may block, which slows a bag or a simulation down (a live source drops instead)."""
+"""Takes a message. It may wait for a bag or a simulation; a live source calls it from several threads, and must not
+wait."""
 
 
 class Offer(NamedTuple):

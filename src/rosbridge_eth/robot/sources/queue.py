@@ -1,15 +1,18 @@
-"""The queue between the threads of a live source and the robot's loop, bounded by bytes.
+"""The queue between a source and the robot's loop, bounded by bytes. Where there is no room, one rule holds:
 
-A live source must not make a publisher wait: ROS would slow the robot down, or drop the connection. So `put` never
-waits. Where there is no room, the oldest message of the topic that takes most of the room is dropped and counted: a
-camera that floods the robot costs images, not the odometry beside it.
+    waits         `put` waits for room: a bag or a simulation is read more slowly
+    otherwise     the oldest message of the topic that takes most of the room is dropped and counted
+
+A live source must not make a publisher wait: ROS would slow the robot down, or drop the connection. So a camera that
+floods the robot costs images, not the odometry beside it.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
+from collections.abc import Mapping
 from typing import Final
 
 from rosbridge_eth.capture import RawMessage
@@ -23,29 +26,35 @@ OVERHEAD: Final = 512
 class Queue:
     """From one or several threads to one. Order is that of `put`, across topics.
 
-    size: bytes that are held at most. dropped: messages that had to make room, by topic.
+    size: bytes that are held at most; a single message may be larger where `put` waits.
     """
 
-    def __init__(self, size: int) -> None:
-        self.dropped = Counter[str]()
-        self._size = size
+    def __init__(self, size: int, *, waits: bool) -> None:
+        self._size, self._waits = size, waits
         self._changed = threading.Condition()
-        self._messages: dict[int, RawMessage] = {}  # by number of arrival
+        self._messages: OrderedDict[int, RawMessage] = OrderedDict()  # by number of arrival
         self._numbers: dict[str, deque[int]] = {}  # of each topic, oldest first
         self._bytes = Counter[str]()  # of each topic
+        self._dropped = Counter[str]()
         self._next = self._total = 0
         self._closed = False
 
-    def put(self, message: RawMessage) -> None:
-        """Keep the message, and drop others to make room for it. Does not wait."""
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def put(self, message: RawMessage) -> bool:
+        """Keep the message. Whether there was none before it."""
+        topic, size = message.topic, len(message.raw) + OVERHEAD
         with self._changed:
+            while self._waits and not self._closed and self._messages and self._total + size > self._size:
+                self._changed.wait()
             if self._closed:
-                return
-            topic, size = message.topic, len(message.raw) + OVERHEAD
-            if size > self._size:
+                return False
+            if not self._waits and size > self._size:
                 self._drop(topic)
-                return
-            while self._total + size > self._size:
+                return False
+            first = not self._messages
+            while not self._waits and self._total + size > self._size:
                 largest = max(self._bytes, key=self._bytes.__getitem__)
                 self._pop(self._numbers[largest][0])
                 self._drop(largest)
@@ -54,20 +63,27 @@ class Queue:
             self._bytes[topic] += size
             self._total += size
             self._next += 1
-            self._changed.notify()
+            return first
 
-    def take(self, timeout: float) -> RawMessage | None:
-        """The oldest message; None after `timeout` seconds without one, or when closed and empty."""
+    def take(self) -> RawMessage | None:
+        """The oldest message; None where there is none. Does not wait."""
         with self._changed:
-            if not self._messages and not self._closed:
-                self._changed.wait(timeout)
-            return self._pop(next(iter(self._messages))) if self._messages else None
+            if not self._messages:
+                return None
+            if self._waits and self._total <= self._size // 2:  # not at each message: waking a thread costs more
+                self._changed.notify_all()
+            return self._pop(next(iter(self._messages)))
 
     def close(self) -> None:
-        """Take no more; what is there can still be taken, and a waiting `take` returns."""
+        """Keep nothing more, and let nobody wait; what is there can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+    @property
+    def lost(self) -> Mapping[tuple[str, str], int]:
+        """Messages that had to make room, by topic and "dropped"."""
+        return {(topic, "dropped"): count for topic, count in dict(self._dropped).items()}
 
     def _pop(self, number: int) -> RawMessage:
         """Of its topic, a message is always the oldest when it leaves."""
@@ -79,8 +95,8 @@ class Queue:
         return message
 
     def _drop(self, topic: str) -> None:
-        self.dropped[topic] += 1
-        if self.dropped[topic] == 1:
+        self._dropped[topic] += 1
+        if self._dropped[topic] == 1:
             log.warning(
                 "%s: messages arrive faster than they are taken, and the oldest are dropped and counted; "
                 "set a rate, or choose fewer fields or topics", topic,

@@ -15,6 +15,7 @@ from pathlib import Path
 from ports import free_port
 from rosbridge_eth.capture import Capture, RawMessage, TopicRule, parse_line
 from rosbridge_eth.robot.sources import Selection
+from rosbridge_eth.robot.sources.queue import Queue
 from rosbridge_eth.robot.sources.ros1.source import Ros1Source
 
 SYSTEM_PYTHON = "/usr/bin/python3"  # where Debian's ROS packages are, whatever environment this runs in
@@ -97,7 +98,7 @@ class Graph:
 
 
 class Listening:
-    """A source that runs in a thread; every message goes through Capture, as in a robot.
+    """A source that runs in a thread, and its queue; every message goes through Capture in a second one, as in a robot.
 
     tolerant: a message that cannot be captured is no failure.
     """
@@ -113,27 +114,40 @@ class Listening:
         self._tolerant = tolerant
         self.failure: list[BaseException] = []
         self.take: Callable[[RawMessage], object] = self.keep
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.queue = Queue(2 * self.source.max_message, waits=False)
+        parts = self._run, self._emit
+        self._threads = [threading.Thread(target=self._do, args=(part,), daemon=True) for part in parts]
 
     def __enter__(self) -> Listening:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop.set()
-        self._thread.join(10)
-        assert not self._thread.is_alive()
+        for thread in self._threads:
+            thread.join(10)
+            assert not thread.is_alive()
         if self.failure:
             raise self.failure[0]
 
-    def _run(self) -> None:
+    def _do(self, what: Callable[[], None]) -> None:
         try:
-            self.source.run(self._emit, self.stop)
+            what()
         except BaseException as error:
             self.failure.append(error)
 
-    def _emit(self, raw: RawMessage) -> None:
-        self.take(raw)
+    def _run(self) -> None:
+        self.source.run(self.queue.put, self.stop)
+
+    def _emit(self) -> None:
+        while not self.stop.wait(0.002):
+            while (raw := self.queue.take()) is not None:
+                self.take(raw)
+
+    @property
+    def lost(self) -> dict[tuple[str, str], int]:
+        return {**self.source.lost, **self.queue.lost}
 
     def keep(self, raw: RawMessage) -> None:
         self.raw.append(raw)

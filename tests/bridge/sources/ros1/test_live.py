@@ -64,7 +64,7 @@ def test_typed_custom_latched_empty_and_huge_messages(graph):
         graph.publish(
             "another", {"topic": "/huge", "kind": "image", "size": too_huge, "count": 1},
         )  # fmt: skip
-        eventually(lambda: listening.source.lost == {("/huge", "too_large"): 1}, "the largest one is passed over")
+        eventually(lambda: listening.lost == {("/huge", "too_large"): 1}, "the largest one is passed over")
         graph.publish("a_third", {"topic": "/huge", "kind": "image", "size": 1, "count": 1})
         assert listening.wait_for("/huge", 3)[-1]["width"] == 1
 
@@ -123,7 +123,7 @@ def test_a_publisher_that_is_killed_and_started_again(graph):
     resumed = numbers.index(10_000)  # it waits for its subscriber, so its first message arrives
     assert numbers[:resumed] == list(range(resumed))
     assert numbers[resumed:] == list(range(10_000, 10_000 + len(numbers) - resumed))
-    assert listening.source.lost == {}
+    assert listening.lost == {}
 
 
 def test_a_master_that_is_not_there_yet_and_one_that_is_restarted(own):
@@ -203,7 +203,7 @@ def test_a_hundred_hertz_on_ten_topics_without_a_loss(graph):
             listening.wait_for(topic, 1000, 60)
     for topic in topics:
         assert listening.numbers(topic) == list(range(1000))
-        assert (topic, "dropped") not in listening.source.lost
+        assert (topic, "dropped") not in listening.lost
 
 
 def test_what_is_published_now_is_offered_with_types_and_nodes(graph):
@@ -259,14 +259,14 @@ def test_messages_are_dropped_and_counted_while_nobody_takes_them(graph):
     listening.take = lambda raw: (take.wait(), listening.keep(raw))
     with listening:
         graph.publish("flood", {"topic": "/flood", "kind": "number", "count": 200})
-        eventually(lambda: sum(listening.source.lost.values()) >= 200 - 17, "everything is received")
-        dropped = listening.source.lost["/flood", "dropped"]
+        eventually(lambda: sum(listening.lost.values()) >= 200 - 17, "everything is received")
+        dropped = listening.lost["/flood", "dropped"]
         take.set()
         listening.wait_for("/flood", 200 - dropped)
     numbers = listening.numbers("/flood")
     assert numbers[-15:] == list(range(185, 200))  # the newest are kept
     assert len(numbers) in (16, 17)  # as many as may wait, and the one that was being emitted
-    assert listening.source.lost["/flood", "dropped"] == dropped == 200 - len(numbers)
+    assert listening.lost["/flood", "dropped"] == dropped == 200 - len(numbers)
 
 
 def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
@@ -295,4 +295,4 @@ def test_what_is_captured_of_a_live_robot_can_be_rebuilt_from_its_lines(graph):
         assert (record.source, record.clock) == ("ros1", True)
         assert 0 < record.captured_ns - record.received_ns < 10**10
         assert restoration.decoder.encode(restoration.restore(record.data).message) == raw.raw
-    assert capture.loss_lines(listening.source.lost) == []
+    assert capture.loss_lines(listening.lost) == []

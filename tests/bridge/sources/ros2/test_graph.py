@@ -244,6 +244,7 @@ source.watch(Selection(["/second"]))
 print(told.get(timeout=20))
 stop.set()
 running.join()
+source.close()
 """
 
 

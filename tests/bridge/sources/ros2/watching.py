@@ -28,15 +28,13 @@ from rosbridge_eth.capture import (
 from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources import Selection, open_source
-from rosbridge_eth.robot.sources.ros2 import source as ros2
+from rosbridge_eth.robot.sources.queue import Queue
 
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s %(message)s")
 stop, taken = threading.Event(), Counter[str]()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
 before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 config = load_robot_config(Path(sys.argv[1]))
-if "hold" in sys.argv:
-    ros2.QUEUE = 2 << 20  # type: ignore[misc]
 
 
 def say(value: dict[str, object]) -> None:
@@ -53,8 +51,6 @@ def rebuilt(record: Record) -> bool:
 
 
 def emit(raw: RawMessage) -> None:
-    if "hold" in sys.argv:
-        sys.stdin.read()
     taken[raw.topic] += 1
     captured = capture.process(raw, time.time_ns())
     if captured is not None:
@@ -70,15 +66,31 @@ try:
             "handlers_kept": before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)],
         }
     )
-    source.run(emit, stop)
+    queue = Queue(2 << 20 if "hold" in sys.argv else 128 << 20, waits=False)
+    ended = threading.Event()
+
+    def run() -> None:
+        try:
+            source.run(queue.put, stop)
+        finally:
+            ended.set()
+
+    threading.Thread(target=run, name="source").start()
+    if "hold" in sys.argv:
+        sys.stdin.read()
+    while queue or not ended.wait(0.01):
+        if (raw := queue.take()) is not None:
+            emit(raw)
+    source.close()
 except SourceError as error:
     say({"error": str(error)})
     sys.exit(error.exit_code)
-for line in capture.loss_lines(source.lost):
+for line in capture.loss_lines({**source.lost, **queue.lost}):
     say({"declared": json.loads(line)})
+lost_here = {**source.lost, **queue.lost}
 statistics: dict[str, dict[str, int]] = {}
-for topic in {*taken, *(topic for topic, _ in source.lost)}:
-    lost = {what: source.lost.get((topic, what), 0) for what in ("lost", "foreign", "dropped")}
+for topic in {*taken, *(topic for topic, _ in lost_here)}:
+    lost = {what: lost_here.get((topic, what), 0) for what in ("lost", "foreign", "dropped")}
     statistics[topic] = {"received": taken[topic] + lost["dropped"], **lost}
 say({"statistics": statistics})
 say({"threads": [thread.name for thread in threading.enumerate()]})

@@ -29,7 +29,7 @@ from rosbridge_eth.capture import RawMessage
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources.live import LiveSource
-from rosbridge_eth.robot.sources.protocol import Clock, Offer, Selection
+from rosbridge_eth.robot.sources.protocol import Clock, Emit, Offer, Selection
 from rosbridge_eth.robot.sources.ros1 import api, tcpros
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,6 @@ MAX_CONNECTIONS: Final = 512
 """Connections to publishers at once: threads, and file descriptors, of which a process usually has 1,024."""
 FAREWELL: Final = 0.6
 """Seconds in which the master is told that we leave."""
-STOP_PATIENCE: Final = 1.0
 FIRST_RETRY: Final = 0.1
 LAST_RETRY: Final = 10.0
 """Seconds between attempts to reach a publisher: doubled at each failure."""
@@ -67,7 +66,7 @@ class Ros1Source(LiveSource):
 
     master: URI; None is ROS_MASTER_URI. hostname: under which the master reaches us; None is ROS_HOSTNAME, ROS_IP or
     the address towards the master. node: our name; None is one of its own for each process.
-    max_message: bytes; the queue holds two of them. timeout: seconds for a call, and for a publisher's header.
+    max_message: bytes. timeout: seconds for a call, and for a publisher's header.
     """
 
     kind = "ros1"
@@ -77,7 +76,7 @@ class Ros1Source(LiveSource):
         hostname: str | None = None, node: str | None = None, max_message: int = 32 << 20, timeout: float = 5.0,
     ) -> None:  # fmt: skip
         """Raises SourceError for a master's address that is none."""
-        super().__init__(selection, clock, 2 * max_message)
+        super().__init__(selection, clock)
         self.timeout, self._hostname = timeout, hostname
         self._master = api.master_address(master)
         self.caller_id = name = api.node_name(node)
@@ -97,16 +96,14 @@ class Ros1Source(LiveSource):
             raise SourceError(f"the ROS master at {self._master} does not answer: {api.why(error)}") from None
 
     def close(self) -> None:
-        """End within STOP_PATIENCE; the master is told."""
-        self._ending.set()
-        self._rung.set()
-        if self._receiving.is_alive():
-            self._receiving.join(STOP_PATIENCE)
+        """Let `run` come to its end, which tells the master."""
+        self._stop.set()
 
-    def _receive(self) -> None:
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        self._emit, self._stop = emit, stop
         while (own := api.own_host(self._hostname, self._master)) is None:
             self._say("master", f"there is no way to the master at {self._master}; trying again")
-            if self._ending.wait(RESOLVE_EVERY):
+            if stop.wait(RESOLVE_EVERY):
                 return
         try:
             server = api.Server(api.bind_host(own), self._answer)
@@ -115,10 +112,11 @@ class Ros1Source(LiveSource):
         self._uri = f"http://{Address(own, server.server_address[1])}/"
         with contextlib.closing(server):
             try:
-                while not self._ending.is_set():
+                while not stop.is_set():
                     self._look()
-                    self._ending.wait(REST)
-                    self._rung.wait(RESOLVE_EVERY)
+                    for _ in range(round(RESOLVE_EVERY / REST)):
+                        if stop.wait(REST) or self._rung.is_set():
+                            break
             finally:
                 self._leave()
 
@@ -176,7 +174,7 @@ class Ros1Source(LiveSource):
         self._well_again(f"register {name}")
         topic.publishers = {uri: each for uri, each in topic.publishers.items() if not each.over.is_set()}
         for uri in topic.listed:
-            if uri in topic.publishers or self._ending.is_set():
+            if uri in topic.publishers or self._stop.is_set():
                 continue
             if sum(len(each.publishers) for each in self._topics.values()) >= MAX_CONNECTIONS:
                 self._say("room", f"more than {MAX_CONNECTIONS} publishers; some of {name} are left out")
@@ -224,7 +222,7 @@ class Ros1Source(LiveSource):
     def received(self, topic: str, publication: tcpros.Publication, body: bytes) -> None:
         """A message is complete."""
         received_ns = self._clock.wall_ns()
-        self._queue.put(RawMessage(topic, publication.type_name, received_ns, body, publication.decoder))
+        self._emit(RawMessage(topic, publication.type_name, received_ns, body, publication.decoder))
 
     def passed_over(self, topic: str, length: int) -> None:
         """A message is not read."""

@@ -21,13 +21,11 @@ from typing import Any, Final
 from rosbridge_eth.capture import Decoder, RawMessage, Wire, decoder_for
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources.live import LiveSource
-from rosbridge_eth.robot.sources.protocol import Clock, Offer, Selection
+from rosbridge_eth.robot.sources.protocol import Clock, Emit, Offer, Selection
 from rosbridge_eth.robot.sources.ros2 import rclpy_parts as parts
 
 log = logging.getLogger(__name__)
 
-QUEUE: Final = 128 << 20
-"""Bytes that wait to be captured; twice the largest message that is decoded."""
 LOOK_EVERY: Final = 0.25
 """Seconds between looks at the graph: what a late topic publishes before is missed, unless it is latched."""
 AT_ONCE: Final = 32
@@ -69,12 +67,12 @@ class Ros2Source(LiveSource):
         domain: int | None = None, node: str = "rosbridge_eth", depth: int = 256,
     ) -> None:  # fmt: skip
         """Joins the graph. Raises SourceError if rclpy is not there or cannot."""
-        super().__init__(selection, clock, QUEUE)
+        super().__init__(selection, clock)
         self._depth = depth
         self._topics: dict[tuple[str, str], _Topic] = {}
         self._unusable: set[tuple[str, str]] = set()
         self._look_now = False
-        self._closing = threading.Lock()
+        self._running = threading.Lock()
         self._rclpy = parts.import_rclpy()
         self._context = self._rclpy.Context()
         try:
@@ -97,24 +95,25 @@ class Ros2Source(LiveSource):
         return self._read_graph()
 
     def close(self) -> None:
-        """Leave the graph."""
-        if not self._closing.acquire(blocking=False):
-            return
-        self._ending.set()
-        self._queue.close()
+        """Leave the graph, when `run` has ended."""
+        self._stop.set()
         self._executor.wake()
-        if self._receiving.is_alive():
-            self._receiving.join(STOP_TIME)
-        self._executor.shutdown(timeout_sec=STOP_TIME)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        with self._running:
+            if self._context.ok():
+                self._executor.shutdown(timeout_sec=STOP_TIME)
+                self._node.destroy_node()
+                self._context.try_shutdown()
 
-    # The receiving thread
+    def run(self, emit: Emit, stop: threading.Event) -> None:
+        """Emit what arrives. Raises SourceError."""
+        self._emit, self._stop = emit, stop
+        with self._running:
+            self._spin()
 
-    def _receive(self) -> None:
+    def _spin(self) -> None:
         try:
             due = began = self._now()
-            while not self._ending.is_set():
+            while not self._stop.is_set():
                 now = self._now()
                 if now >= due or self._look_now:
                     self._look(tell=now - began > UNMATCHED_AFTER)
@@ -239,7 +238,7 @@ class Ros2Source(LiveSource):
             if number > last + 1:
                 self._tell_lost(name, number - last - 1)
         received_ns = info.get("received_timestamp") or self._clock.wall_ns()
-        self._queue.put(RawMessage(name, topic.offer.type_name, received_ns, raw, topic.decoder))
+        self._emit(RawMessage(name, topic.offer.type_name, received_ns, raw, topic.decoder))
 
     # What a person is told, once
 
