@@ -99,8 +99,8 @@ class Robot:
     def take_up(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
         """Go on by other topics, nodes and [capture], and seal for these readers; to be called in the loop's thread."""
         self._add_losses(time.monotonic())
-        self.box.take_up(config.triggers())
-        self.capture.take_up(config.rules())
+        self.box.change_rules(config.triggers())
+        self.capture.change_rules(config.rules())
         self.source.watch(Selection.of(config))
         self.writer.take_up(readers)
 
