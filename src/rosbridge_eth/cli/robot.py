@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
-"""Topics of ROS itself; they are taken only where they are named."""
 TAKEN_WITHIN = 10.0  # seconds for a running robot to see what `trigger` asks for; it looks once a second
 
 
