@@ -17,6 +17,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TypeVar
@@ -26,7 +27,7 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, time_text
+from rosbridge_eth.config.values import Address, counted, parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
@@ -152,6 +153,9 @@ class Robot:
                     self._finish(now)
                 else:
                     self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
+                if shard := self.sender.elsewhere:
+                    with suppress(ValueError):
+                        self.loop.go(parse_address(shard), now)
                 self.loop.seek(now)
                 self._send(now)
                 on_turn()
