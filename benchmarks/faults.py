@@ -36,7 +36,7 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import pairwise
@@ -293,11 +293,21 @@ class Site:
         until("the node answers", lambda: "A local chain answers" in node.said or node.ended())
         assert not node.ended(), node.said
 
-    def kill_node(self) -> None:
-        """Everything that belongs to it, at any moment after it has written down that the robot is registered."""
+    def kill_node(self, wait: float) -> None:
+        """Everything that belongs to it, so many seconds after it has written down that the robot is registered.
+
+        wait: below 4; it writes again after five seconds, and a kill in the middle may cost the file.
+        """
         assert self.node is not None
         state, registered = self.home.path / "chain.json", time.time()
-        until("the node has written its state", lambda: state.exists() and state.stat().st_mtime > registered, 20)
+
+        def is_written() -> bool:
+            with suppress(OSError, ValueError):
+                return state.stat().st_mtime > registered and bool(json.loads(state.read_bytes()))
+            return False
+
+        until("the node has written its state", is_written, 20)
+        time.sleep(wait)
         for pid in family(self.node.pid):
             kill(pid)
         self.node.kill()
@@ -598,7 +608,7 @@ def kill_node(site: Site, seed: int) -> Count:
     flow = Flow(site, "node killed", seed)
     flow.start()
     flow.pause(0.3, 0.9)
-    site.kill_node()
+    site.kill_node(flow.random.uniform(0, 3))
     flow.event("kill -9 node")
     flow.pause(0.1, 0.5)
     site.start_node()

@@ -106,7 +106,7 @@ def user_end(quick: bool) -> Part:
             "whole": milliseconds(whole), "series": series,
         }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        rate, per_chunk_, stored = bridge_costs.throughput(who, Path(folder), messages, False)
+        rate, per_chunk_, stored, _ = bridge_costs.throughput(who, Path(folder), messages, False)
     opening = 2  # lines of the stream that are no messages: what it is from, and the type's definition
     return part | {"rate": rate, "per_chunk": per_chunk_, "delivered": stored - opening}
 

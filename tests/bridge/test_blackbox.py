@@ -166,12 +166,12 @@ def test_a_clock_that_is_set_back_ends_what_was_written_because_of_an_event():
     assert len(box.released) == 2, "it is not written for an hour"
 
 
-def test_other_rules_are_taken_up_and_what_is_kept_for_the_same_stays():
+def test_rules_are_changed_and_what_is_kept_for_the_same_stays():
     same, other = TriggerRule("a", S, S, 1 << 20), TriggerRule("b", S, S, 1 << 20)
     box = BlackBox([same, other])
     for name in ("a", "b"):
         box.keep(name, Record("/x", START, b"x", None))
-    box.take_up([same, other._replace(after_ns=2 * S), TriggerRule("c", S, S, 1 << 20)])
+    box.change_rules([same, other._replace(after_ns=2 * S), TriggerRule("c", S, S, 1 << 20)])
     assert [len(trigger.ring) for trigger in box.triggers.values()] == [1, 0, 0]
 
 

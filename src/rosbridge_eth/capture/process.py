@@ -73,9 +73,9 @@ class Capture:
         self._source_kind = source_kind
         self._live = live
         self._declared: Counter[tuple[str, str]] = Counter()  # losses that are in a line already, by topic and why
-        self.take_up(rules)
+        self.change_rules(rules)
 
-    def take_up(self, rules: Sequence[TopicRule]) -> None:
+    def change_rules(self, rules: Sequence[TopicRule]) -> None:
         """Go on by other rules. A topic whose rule stays the same goes on as it is. ValueError: by the old ones."""
         patterns, selections = [NamePattern(rule.topic) for rule in rules], [parse_paths(rule.fields) for rule in rules]
         self._rules = list(zip(patterns, rules, strict=True))

@@ -194,9 +194,9 @@ class BlackBox:
         self.released: deque[Record] = deque()
         self.lost: Counter[tuple[str, str]] = Counter()
         self.newest_ns = 0
-        self.take_up(rules)
+        self.change_rules(rules)
 
-    def take_up(self, rules: Iterable[TriggerRule]) -> None:
+    def change_rules(self, rules: Iterable[TriggerRule]) -> None:
         """Go on by other rules. What is kept for one that stays the same stays."""
         known = {trigger.rule: trigger for trigger in self.triggers.values()}
         self.triggers = {rule.name: known.get(rule) or Trigger(rule) for rule in rules}

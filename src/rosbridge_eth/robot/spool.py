@@ -28,13 +28,14 @@ _APPLICATION: Final = 0x52425350  # "RBSP"
 _BARE_SHARE: Final = 8  # of what is there, for chunks without body
 _SPARE: Final = 64 * 1024  # bytes removed beyond a chunk's own on a full disk, where pages count and not bytes
 _FEW: Final = 32  # rows that one transaction removes: on a full disk there is little room for its log
-_DROPPED: Final = 0.0
-"""When a chunk was taken whose body was given up since."""
+_DROPPED, _CONFIRMED = 0.0, -1.0
+"""When a chunk was taken whose body was given up since, and the newest one that is confirmed."""
 
 
 class SpoolStatistics(NamedTuple):
-    """What is in the spool. unstored: chunks above the server's head, as it was told last; aside: refused ones, which
-    are not among the `chunks`. dropped_bodies: those that were given up since it was opened, and the server had not.
+    """What is in the spool and not confirmed. unstored: chunks above the server's head, as it was told last; aside:
+    refused ones, which are not among the `chunks`. dropped_bodies: those that were given up since it was opened, and
+    the server had not.
     """
 
     chunks: int
@@ -98,7 +99,8 @@ class Spool:
 
     def statistics(self) -> SpoolStatistics:
         """What is in the spool at this moment."""
-        every, unstored = (self._store.behind(self._tk, place) for place in (NOWHERE, self._covered))
+        first = [row.place for row in self.rows(NOWHERE, 1) if row.taken_at == _CONFIRMED]
+        every, unstored = (self._store.behind(self._tk, max([place, *first])) for place in (NOWHERE, self._covered))
         aside = len(self._store.dead(DEAD_LETTERS)) if self._aside else 0
         return SpoolStatistics(*every[:3], unstored.chunks, aside, self._dropped_bodies)
 
@@ -110,11 +112,15 @@ class Spool:
         self._covered = head
 
     def confirmed(self, place: bytes) -> int:
-        """What is up to this place leaves the spool; what is set aside stays. Returns how many."""
+        """What is up to this place leaves the spool, but for the newest of it, which shows a fork if there is one; what
+        is set aside stays. Returns how many are newly confirmed."""
         count = 0
-        while rows := [row for row in self.rows(NOWHERE, _FEW) if row.place <= place]:
-            self._remove(rows)
-            count += len(rows)
+        while len(rows := [row for row in self.rows(NOWHERE, _FEW) if row.place <= place]) > 1:
+            self._remove(rows[:-1])
+            count += sum(row.taken_at != _CONFIRMED for row in rows[:-1])
+        if rows and rows[0].taken_at != _CONFIRMED:
+            self._store.replace(self._tk, Chunk.parse(*self.chunks([rows[0].place])), _CONFIRMED)
+            count += 1
         return count
 
     def set_aside(self, digest: bytes) -> bytes | None:

@@ -136,7 +136,6 @@ class Submitter:
         self._fees = Fees(0, 0)
         self._pause = IDLE
         self._looked_at = self._minute_at = self._hour_at = 0.0
-        self.asked: set[bytes] = set()  # robots at which it looked, so that the store knows what the chain has of them
         self.trouble: str | None = None  # why nothing can be written at all
         self.unconfirmed: str | None = None  # why nothing can be confirmed
         self.funds: str | None = None  # why accounts are not topped up
@@ -221,13 +220,12 @@ class Submitter:
         """Compare one robot's log in the store with what the chain has of it; what there is to send."""
         standing, then, state = look
         found: list[Work] = []
-        certificates = contract.NOTHING if standing.revoked else standing.certificates_hash
-        changes: dict[str, Any] = {"certificates": certificates}
+        changes: dict[str, Any] = {}
         try:
             after = self._place(tk, standing, state)
             if then is not None:
-                changes |= self._confirmed(tk, account, then, state)
-            self.asked.add(tk)
+                changes = self._confirmed(tk, account, then, state)
+            changes["certificates"] = contract.NOTHING if standing.revoked else standing.certificates_hash
             self._may_write(tk, standing)
             if after is not None and (rows := self._store.rows(tk, after, 1)) and rows[0].place <= state.head:
                 found.append(Work(tk, standing, after, state.head, rows[0].taken_at))

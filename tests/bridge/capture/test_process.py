@@ -190,7 +190,7 @@ def test_a_malformed_rule_is_refused_at_once():
 def test_rules_that_are_refused_leave_the_old_ones_in_force():
     capture = Capture([TopicRule("/n", fields=("x",))])
     with pytest.raises(ValueError, match="is not a field path"):
-        capture.take_up([TopicRule("/m"), TopicRule("/n", fields=("x..y",))])
+        capture.change_rules([TopicRule("/m"), TopicRule("/n", fields=("x..y",))])
     assert capture.process(number(1), 0) is not None
     assert capture.process(number(1, topic="/m"), 0) is None
 
@@ -201,14 +201,14 @@ def test_other_rules_leave_what_is_unchanged_as_it_is_and_lose_no_count():
         assert capture.process(number(1, topic=topic), 0) is not None
     assert capture.process(blob(50_000), 0) is None
     assert len(capture.loss_lines({("/n", "dropped"): 2})) == 2
-    capture.take_up([TopicRule("/once", once=True), TopicRule("/b", limit=10), TopicRule("/new", fields=("x",))])
+    capture.change_rules([TopicRule("/once", once=True), TopicRule("/b", limit=10), TopicRule("/new", fields=("x",))])
     assert capture.process(number(2, topic="/once"), 0) is None, "its one message was captured before"
     assert capture.process(number(2), 0) is None
     assert capture.process(blob(50_000), 0) is not None, "by the new rule, a digest"
     captured = capture.process(number(2, topic="/new"), 0)
     assert captured is not None and data(captured) == {"x": 2}
     assert capture.loss_lines({("/n", "dropped"): 2}) == [], "nothing is said twice"
-    capture.take_up([TopicRule("/b", limit=61440)])
+    capture.change_rules([TopicRule("/b", limit=61440)])
     assert capture.process(blob(50_000), 0) is None
     [line] = capture.loss_lines({("/n", "dropped"): 2})
     assert parse_line(line) == LostLine(1, "/b", "record_too_large")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -87,6 +87,8 @@ class World:
         self.folder, self.now = folder, 1_700_000_000.0
         self.pens = [Pen(f"robot_{n}", n) for n in range(1, robots + 1)]
         self.settings, self.stores = Settings(**settings), 0
+        self.robots: Callable[[], Sequence[bytes]] = lambda: [pen.tk for pen in self.pens]
+        self.pays = True
         self.chain = ModelChain() if ledger is None else None
         self.ledger = ledger or self.chain
         for pen in self.pens:
@@ -139,18 +141,19 @@ class World:
         """A new submitter, which remembers nothing."""
         accounts = {pen.tk: pen.account for pen in self.pens}
         self.submitter = Submitter(
-            self.ledger, self.store, lambda: [pen.tk for pen in self.pens], accounts.get, KEYS.operator, self.settings
-        )
+            self.ledger, self.store, self.robots, accounts.get, KEYS.operator if self.pays else None, self.settings,
+            others=lambda: accounts.keys() - set(self.robots()),
+        )  # fmt: skip
         return self.submitter
 
     def take(self, chunks: Sequence[Chunk], pen: Pen | None = None) -> list[Outcome]:
         return self.store.append((pen or self.pen).offers(chunks, self.state(pen).digest), self.now)
 
     def talk(self, pen: Pen | None = None) -> list[Outcome]:
-        """The robot is told the state, and sends what follows; not before the chain was asked."""
+        """The robot is told the state, and sends what follows."""
         pen = pen or self.pen
         [state] = self.store.states([pen.tk])
-        return self.store.append(pen.told(state), self.now) if pen.tk in self.submitter.asked else []
+        return self.store.append(pen.told(state), self.now)
 
     def turn(self, seconds: float = 1.0, *, mine: int = 0) -> float:
         self.now += seconds

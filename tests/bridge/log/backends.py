@@ -33,8 +33,8 @@ class Backend(Protocol):
     def open(self, *, max_bytes: int = PLENTY, share: int = PLENTY, read_only: bool = False) -> Store:
         """Another Store on the same data."""
         return open_store(
-            self.url, home=self.folder, ledger=self.ledger, max_bytes=max_bytes, max_bytes_per_robot=share,
-            read_only=read_only,
+            self.url, file=self.folder / "store.sqlite", ledger=self.ledger, max_bytes=max_bytes,
+            max_bytes_per_robot=share, read_only=read_only,
         )  # fmt: skip
 
     def copy(self) -> Any:

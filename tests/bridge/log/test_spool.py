@@ -83,16 +83,17 @@ def test_chunks_come_back_unchanged_in_the_order_of_the_log(spool):
 def test_what_is_confirmed_leaves_with_all_before_it_and_what_the_next_chunk_needs_stays(path, spool):
     first, second = fill(spool, 40), fill(spool, 3, stream=OTHER)
     assert spool.confirmed(place(first[1])) == 2
-    assert all_of(spool)[0] == first[2]
+    assert all_of(spool) == [*first[1:], *second]
     assert spool.confirmed(place(second[0])) == 39
-    assert spool.confirmed(place(first[2])) == 0  # told again
-    assert all_of(spool) == second[1:]
+    assert spool.confirmed(place(first[2])) == spool.confirmed(place(second[0])) == 0  # told again
+    assert all_of(spool) == second
     assert spool.confirmed(OTHER + b"\xff" * 8) == 2
     spool.close()
     again = open_spool(path)
     assert (again.newest, again.last_digest) == (place(second[-1]), second[-1].header.digest)
     made = fill(again, 2, stream=b"u" * 16)
-    assert all_of(again) == made
+    assert all_of(again) == [second[-1], *made]
+    assert again.statistics()[:4] == (2, 10, size_of(*made), 2)
     again.close()
 
 
@@ -134,7 +135,7 @@ def test_what_is_refused_is_set_aside_and_not_sent_again(path, spool):
     spool.confirmed(spool.newest)
     spool.close()
     again = open_spool(path)
-    assert (again.statistics().aside, again.statistics().chunks) == (1, 0)
+    assert (again.statistics().aside, again.statistics().chunks, len(all_of(again))) == (1, 0, 1)
     again.close()
 
 
@@ -350,7 +351,7 @@ class Model(RuleBasedStateMachine):
         self.spool = open_spool(self.path, self.LIMIT)
         self.rows: list[Chunk] = []
         self.aside: list[Chunk] = []
-        self.covered, self.last = NOWHERE, NO_DIGEST
+        self.covered, self.last, self.confirmed_to = NOWHERE, NO_DIGEST, NOWHERE
         self.stream, self.number, self.drops = 0, 0, 0
 
     def teardown(self) -> None:
@@ -398,9 +399,11 @@ class Model(RuleBasedStateMachine):
     @rule(data=st.data())
     def confirmed(self, data: st.DataObject) -> None:
         upto = self._place(data)
-        kept = [one for one in self.rows if place(one) > upto]
-        assert self.spool.confirmed(upto) == len(self.rows) - len(kept)
-        self.rows = kept
+        gone = [one for one in self.rows if place(one) <= upto]
+        assert self.spool.confirmed(upto) == sum(place(one) > self.confirmed_to for one in gone)
+        if gone:
+            self.confirmed_to = place(gone[-1])
+            self.rows = [gone[-1], *self.rows[len(gone) :]]
 
     @rule(data=st.data())
     def set_aside(self, data: st.DataObject) -> None:
@@ -419,9 +422,10 @@ class Model(RuleBasedStateMachine):
     def agree(self) -> None:
         assert all_of(self.spool) == self.rows
         assert self.spool.last_digest == self.last
+        rest = [one for one in self.rows if place(one) > self.confirmed_to]
         assert self.spool.statistics() == (
-            len(self.rows), sum(one.header.records for one in self.rows), size_of(*self.rows),
-            sum(place(one) > self.covered for one in self.rows), len(self.aside), self.drops,
+            len(rest), sum(one.header.records for one in rest), size_of(*rest),
+            sum(place(one) > self.covered for one in rest), len(self.aside), self.drops,
         )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
@@ -57,17 +58,20 @@ class BagSource(Source):
             reader = Rosbag1Reader(path) if self._wire is Wire.ROS1 else Rosbag2Reader(path)
             reader.open()
             self._reader = reader
-            self._connections = [  # old recorders left the topic's leading slash out
+            connections = [  # old recorders left the topic's leading slash out
                 (connection, f"/{connection.topic.removeprefix('/')}", normalised_type_name(connection.msgtype))
                 for connection in reader.connections
             ]
-            self._distribution = reader.ros_distro if isinstance(reader, Rosbag2Reader) else None
         self.span = reader.start_time, reader.end_time - 1
         """When the first and the last message were received (ns since 1970); of an empty bag the first is the later."""
+        nodes = defaultdict[tuple[str, str], set[str]](set)
+        for connection, topic, name in connections:
+            caller = connection.ext.callerid if isinstance(connection.ext, ConnectionExtRosbag1) else None
+            nodes[topic, name].update([caller] if caller else [])
+        self._offers = tuple(Offer(topic, name, tuple(sorted(nodes[topic, name]))) for topic, name in sorted(nodes))
         try:
-            self._offers = self._read_offers()
             watched = {offer.topic for offer in selection.resolve_all(self._offers, self._where)}
-            self._decoders = self._read_definitions(watched, selection)
+            self._watched = self._decoded([each for each in connections if each[1] in watched], selection)
         except SourceError:
             self.close()
             raise
@@ -80,27 +84,25 @@ class BagSource(Source):
 
     def decoders(self) -> Mapping[str, Sequence[Decoder]]:
         """The decoders of each watched topic, to check a configuration before the replay."""
-        found: dict[str, list[Decoder]] = {}
-        for connection, topic, _ in self._connections:
-            if connection.id in self._decoders:
-                found.setdefault(topic, []).append(self._decoders[connection.id])
+        found = defaultdict[str, list[Decoder]](list)
+        for _, topic, _, decoder in self._watched.values():
+            found[topic].append(decoder)
         return found
 
     @property
     def message_count(self) -> int:
         """Messages of the watched topics in the whole bag."""
-        return sum(connection.msgcount for connection, _, _ in self._connections if connection.id in self._decoders)
+        return sum(connection.msgcount for connection, *_ in self._watched.values())
 
     def messages(self) -> Iterator[RawMessage]:
         """The watched messages, in order, without waiting, until the end or `close`. Raises SourceError."""
         if self._reader is None:
             raise SourceError(f"{self._where} is closed")
-        topics = {connection.id: (topic, name) for connection, topic, name in self._connections}
-        chosen = [connection for connection, _, _ in self._connections if connection.id in self._decoders]
         try:
             with self._translated():
-                for connection, received_ns, raw in self._reader.messages(chosen):
-                    yield RawMessage(*topics[connection.id], received_ns, bytes(raw), self._decoders[connection.id])
+                for connection, received_ns, raw in self._reader.messages([each[0] for each in self._watched.values()]):
+                    _, topic, name, decoder = self._watched[connection.id]
+                    yield RawMessage(topic, name, received_ns, bytes(raw), decoder)
         except SourceError:
             if self._reader is not None:  # else it was closed meanwhile, and is over
                 raise
@@ -109,14 +111,12 @@ class BagSource(Source):
         """Replay at the set speed until the end or `stop`. Raises SourceError."""
         due, last = self._clock.monotonic_ns(), None
         for message in self.messages():
-            if self._speed is None:
-                if stop.is_set():
-                    return
-            else:
+            if self._speed is not None:
                 passed = 0 if last is None else min(max(message.received_ns - last, 0), MAX_WAIT_NS)
                 due, last = due + round(passed / self._speed), message.received_ns
-                if self._clock.wait_until(due, stop):
-                    return
+                self._clock.wait_until(due, stop)
+            if stop.is_set():
+                return
             emit(message)
 
     def close(self) -> None:
@@ -126,36 +126,27 @@ class BagSource(Source):
             with self._translated():
                 reader.close()
 
-    def _read_offers(self) -> tuple[Offer, ...]:
-        nodes: dict[tuple[str, str], set[str]] = {}
-        for connection, topic, type_name in self._connections:
-            publishers = nodes.setdefault((topic, type_name), set())
-            if isinstance(connection.ext, ConnectionExtRosbag1) and connection.ext.callerid:
-                publishers.add(connection.ext.callerid)
-        return tuple(Offer(topic, name, tuple(sorted(found))) for (topic, name), found in sorted(nodes.items()))
-
-    def _read_definitions(self, watched: set[str], selection: Selection) -> dict[int, Decoder]:
-        """The decoders by connection. A topic that is only matched by a pattern is left out if it cannot be decoded."""
-        decoders: dict[int, Decoder] = {}
-        left_out: SourceError | None = None
-        for connection, topic, _ in self._connections:
-            if topic not in watched:
-                continue
+    def _decoded(
+        self, connections: Sequence[tuple[Connection, str, str]], selection: Selection
+    ) -> dict[int, tuple[Connection, str, str, Decoder]]:
+        """By number. A topic that is only matched by a pattern is left out if it cannot be decoded."""
+        decoded: dict[int, tuple[Connection, str, str, Decoder]] = {}
+        for connection, topic, name in connections:
             try:
-                decoders[connection.id] = self._decoder(connection)
+                decoded[connection.id] = connection, topic, name, self._decoder(connection)
             except SourceError as error:
-                if topic in selection.named_topics:
+                if topic in selection.named_topics or len(connections) == 1:
                     raise
-                left_out = error
                 log.warning("%s; the topic is left out", error)
-        if left_out is not None and not decoders:
-            raise left_out
-        return decoders
+        if connections and not decoded:
+            raise SourceError(f"{self._where} has no topic that can be decoded")
+        return decoded
 
     def _decoder(self, connection: Connection) -> Decoder:
         definition = connection.msgdef
         if definition.format is MessageDefinitionFormat.NONE:
-            known = decoder_for_known(self._wire, connection.msgtype, self._distribution)
+            distribution = getattr(self._reader, "ros_distro", None)
+            known = decoder_for_known(self._wire, connection.msgtype, distribution)
             if known is None:
                 raise SourceError(
                     f"{self._where} does not define {connection.msgtype} of {connection.topic}, which ROS does not "

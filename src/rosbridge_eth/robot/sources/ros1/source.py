@@ -50,8 +50,6 @@ STEADY: Final = 10.0
 """A connection that lasted so long was a good one: the next attempt is the first again."""
 STALLED = 30.0
 """Seconds without a byte, within a message, after which a publisher is given up."""
-KEEPALIVE: Final = {"TCP_KEEPIDLE": 60, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 6}
-"""Notice within about two minutes that the other machine is gone."""
 
 
 @dataclass
@@ -193,17 +191,13 @@ class Ros1Source(LiveSource):
         if method == "shutdown":  # by the master, when another node registers under our name; the bridge goes on
             self.caller_id = next(self._other_names)
             log.warning("another node has taken this one's name, or asked it to end: it goes on as %s", self.caller_id)
-        types = [[name, self._type_of(topic)] for name, topic in self._topics.copy().items()]
         answers = {
             "publisherUpdate": 0, "paramUpdate": 0, "shutdown": 0, "getPid": os.getpid(), "getName": self.caller_id,
-            "getMasterUri": f"http://{self._master}/", "getPublications": [], "getSubscriptions": types,
-            "getBusInfo": [], "getBusStats": [[], [], []],
+            "getMasterUri": f"http://{self._master}/", "getPublications": [],
+            "getSubscriptions": [[name, tcpros.ANY] for name in self._topics.copy()], "getBusInfo": [],
+            "getBusStats": [[], [], []],
         }  # fmt: skip
         return [1, "", answers[method]]
-
-    def _type_of(self, topic: _Topic) -> str:
-        found = (publisher.publication for publisher in topic.publishers.copy().values())
-        return next((each.type_name.replace("/msg/", "/") for each in found if each is not None), api.UNKNOWN_TYPE)
 
     # What the publishers' threads tell
 
@@ -288,10 +282,7 @@ class Publisher(threading.Thread):
             self._socket = sock
             if self.over.is_set():
                 return
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            for option, value in KEEPALIVE.items():
-                if hasattr(socket, option):
-                    sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a machine may go without a word
             sock.sendall(tcpros.request_header(self.name, node.caller_id))
             publication = tcpros.read_publication(self.name, tcpros.read_header(stream))
             node.admit(self, publication)
