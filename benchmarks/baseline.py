@@ -137,7 +137,7 @@ def bridge(records: int, per_batch: int) -> dict[str, float]:
     who = bridge_costs.Identities()
     with tempfile.TemporaryDirectory() as folder:
         found = bridge_costs.stage_costs(who, Path(folder), records, per_batch, False)
-        rate, _, _ = bridge_costs.throughput(who, Path(folder), records, False)
+        rate, _, _, _ = bridge_costs.throughput(who, Path(folder), records, False)
     costs, chunks = found["costs"], found["chunks"]
     return {
         "robot_ms": sum(processor for processor, _ in costs["robot"].values()),

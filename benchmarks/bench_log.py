@@ -37,6 +37,7 @@ LOG = Log(b"l" * 32, robot_id("robot_1"))
 ROBOT = sm2.PrivateKey.generate()
 READERS = [sm2.PrivateKey.generate() for _ in range(chunks.MAX_READERS)]
 PUBLIC = [reader.public_key for reader in READERS]
+SECRET = chunks.content_secret(ROBOT)
 
 
 def messages() -> list[tuple[int, Any]]:
@@ -98,7 +99,7 @@ def microseconds(functions: list[Callable[[], object]], seconds: float) -> float
 
 def seal_to(group: list[bytes], readers: int, level: int = chunks.LEVEL) -> chunks.Chunk:
     return seal(LOG, ROBOT, group, stream=bytes(16), number=0, previous=bytes(32), sealed_ms=0,
-                readers=PUBLIC[:readers], level=level)  # fmt: skip
+                readers=PUBLIC[:readers], level=level, secret=SECRET)  # fmt: skip
 
 
 def rows(records: list[bytes], size: int, seconds: float) -> Iterator[tuple[str, float, float | None]]:

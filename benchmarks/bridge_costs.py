@@ -59,6 +59,7 @@ POSE_AND_TWIST = ("header.stamp", "header.frame_id", "child_frame_id", "pose.pos
 NOW = datetime.now(UTC)
 LEDGER, PLACE = bytes(32), Log(bytes(32), robot_id("robot_1"))
 GIB = 1 << 30
+PACE = 165.0  # messages a second of a robot as it is
 
 
 class Identities:
@@ -86,26 +87,30 @@ class Identities:
 
 
 class Odometry:
-    """A source of `count` messages: the sample bag's, again and again."""
+    """A source of `count` messages: the sample bag's, again and again, `pace` of them a second (0: at once)."""
 
     live, kind = False, "bag"
     lost: Mapping[tuple[str, str], int] = {}
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, pace: float = 0.0) -> None:
         bag = BagSource(sample_bag(), Selection([TOPIC]), speed=None)
         self.messages = list(bag.messages())
         bag.close()
-        self.count = count
+        self.count, self.pace = count, pace
 
     def __iter__(self) -> Iterator[RawMessage]:
         for number in range(self.count):
             yield self.messages[number % len(self.messages)]
 
     def run(self, emit: Any, stop: threading.Event) -> None:
+        due = time.monotonic()
         for message in self:
             if stop.is_set():
                 return
             emit(message)
+            if self.pace:
+                due += 1 / self.pace
+                time.sleep(max(0.0, due - time.monotonic()))
 
     def close(self) -> None:
         """Nothing is open."""
@@ -221,10 +226,13 @@ def gas(chunks: list[Chunk]) -> float:
     return float(total)
 
 
-def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tuple[float, float, int]:
+def throughput(
+    who: Identities, folder: Path, records: int, whole: bool, *, pace: float = 0.0
+) -> tuple[float, float, int, float]:
     """From the source to the server's commit, two processes on loopback.
 
-    Records a second, records in a chunk, and lines in the store: the records, and those that open the stream.
+    Records a second, records in a chunk, lines in the store (the records, and those that open the stream), and
+    milliseconds a record of the robot's processor, session and all. pace: messages a second, 0: as fast as it goes.
     """
     sock = server_socket(("127.0.0.1", 0))
     port = sock.getsockname()[1]
@@ -239,16 +247,16 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     serving.start()
     spool, now = who.spool(folder / "spool-2.sqlite"), time.monotonic()
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
-    writer = who.writer(0.05, now)
+    writer = who.writer(1.0 if pace else 0.05, now)
     sender = Sender(client, spool, writer)
     robot = Robot(
-        source=Odometry(records), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
+        source=Odometry(records, pace), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
         writer=writer, spool=spool, client=client, sender=sender,
         servers=[Address("127.0.0.1", port)],
     )  # fmt: skip
-    started = time.perf_counter()
+    started, used = time.perf_counter(), time.process_time()
     robot.run()
-    seconds = time.perf_counter() - started
+    seconds, used = time.perf_counter() - started, time.process_time() - used
     stop.set()
     serving.join(10)
     if robot.captured < records:
@@ -256,7 +264,7 @@ def throughput(who: Identities, folder: Path, records: int, whole: bool) -> tupl
     store = SqliteStore(folder / "store-2.sqlite", LEDGER, GIB, GIB)
     stored = store.waiting(PLACE.tk).records
     store.close()
-    return records / seconds, records / robot.chunks, stored
+    return records / seconds, records / robot.chunks, stored, used / records * 1000
 
 
 def first_edition(folder: Path, records: int) -> dict[str, Any]:
@@ -306,10 +314,14 @@ def main() -> None:
     rates = []
     for whole in (False, True):
         with tempfile.TemporaryDirectory() as folder:
-            rate, per_chunk_, _ = throughput(who, Path(folder), options.records, whole)
+            rate, per_chunk_, _, _ = throughput(who, Path(folder), options.records, whole)
         rates.append({"fields": "all" if whole else "pose and twist", "records_per_second": rate})
         print(f"\nThrough loopback, robot and server as two processes, {rates[-1]['fields']}: {rate:,.0f} records/s, "
               f"{per_chunk_:.0f} records a chunk")
+    with tempfile.TemporaryDirectory() as folder:
+        _, per_chunk_, _, paced = throughput(who, Path(folder), int(20 * PACE), False, pace=PACE)
+    print(f"\nAt {PACE:.0f} messages a second, {per_chunk_:.0f} records a chunk: robot {paced:.3f} ms a record, session"
+          " and all")
     if options.first_edition is not None:
         after = first_edition(options.first_edition, 3000)
         for name, figures in (("before", before), ("after", after)):
@@ -318,7 +330,7 @@ def main() -> None:
             print(f"\nFirst edition, {name}: robot {robot:.3f} ms, server {server:.3f} ms a record, "
                   f"{figures['messages_per_second']:,.0f} records/s")
     if options.json:
-        options.json.write_text(json.dumps({"rows": rows, "throughput": rates}, indent=1))
+        options.json.write_text(json.dumps({"rows": rows, "throughput": rates, "paced": paced}, indent=1))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from rosbridge_eth.channel.wire import Answer, Hello, Kind, Malformed, fields, parse_fields
 from rosbridge_eth.log import chunk as chunks
 from rosbridge_eth.log.chunk import Chunk, ChunkError, Header
 from rosbridge_eth.log.hop import HopError, ServerState, decode_offer, encode_offer
@@ -63,7 +64,23 @@ def _state(data: bytes) -> None:
     _require(ServerState.decode(data).encode() == data, "a server's state")
 
 
-READERS: tuple[Callable[[bytes], None], ...] = (_header, _chunk, _plaintext, _offer, _state)
+def _answer(data: bytes) -> None:
+    _require(Answer.parse(data).to_bytes() == data, "a server's answer in the channel")
+
+
+def _hello(data: bytes) -> None:
+    hello, rest = Hello.parse(data)
+    _require(hello.datagram(Kind(data[0]), rest) == data if data[0] in [*Kind] else True, "a handshake's head")
+
+
+def _fields(data: bytes) -> None:
+    parts, offsets = parse_fields(data, 4)
+    _require(fields(parts) == data[: offsets[-1]] and not any(data[offsets[-1] :]), "the fields of a proof")
+
+
+READERS: tuple[Callable[[bytes], None], ...] = (
+    _header, _chunk, _plaintext, _offer, _state, _answer, _hello, _fields,
+)  # fmt: skip
 
 
 def check(data: bytes) -> None:
@@ -72,7 +89,7 @@ def check(data: bytes) -> None:
         return
     try:
         READERS[data[0] % len(READERS)](data[1:])
-    except (ChunkError, HopError):
+    except (ChunkError, HopError, Malformed):
         return
 
 

@@ -41,12 +41,12 @@ def script_of(page: str, marked: str = "") -> tuple[str, list[str]]:
 
 def type_page(
     page: str, folder: Path, *, ports: Mapping[str, int] | None = None, environment: Mapping[str, str] | None = None,
-    before: str = "", marked: str = "", python: str = sys.executable, shell: tuple[str, ...] = ("bash",),
-    typed: str = "",
+    before: str = "", after: str = "", marked: str = "", python: str = sys.executable,
+    shell: tuple[str, ...] = ("bash",), typed: str = "",
 ) -> str:  # fmt: skip
     """Run a page's commands and give what they printed.
 
-    ports: written on the page -> here. before: commands of the test's own. python: that runs the bridge.
+    ports: written on the page -> here. before, after: commands of the test's own. python: that runs the bridge.
     """
     commands, says = script_of(page, marked)
     for written, here in (ports or {}).items():
@@ -62,8 +62,8 @@ def type_page(
     kept |= {"PATH": f"{programs}:{os.environ['PATH']}", "COLUMNS": "120", **(environment or {})}
     with (folder / ".printed").open("wb") as printed:
         process = subprocess.Popen(
-            [*shell, "-c", f"set -euo pipefail\n{before}\n{commands}"], cwd=folder, env=kept, stdin=subprocess.PIPE,
-            stdout=printed, stderr=printed, start_new_session=True,
+            [*shell, "-c", f"set -euo pipefail\n{before}\n{commands}\n{after}"], cwd=folder, env=kept,
+            stdin=subprocess.PIPE, stdout=printed, stderr=printed, start_new_session=True,
         )  # fmt: skip
         assert process.stdin is not None
         process.stdin.write(typed.encode())

@@ -64,7 +64,7 @@ def made(require: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory
         home, robot = OperatorHome(folder / "operator"), RobotHome(folder / "robot")
         keys = admin.init_home(
             home, words["operator"], reader=ReaderHome(folder / "reader"), reader_passphrase=words["reader"], now=now,
-            listen=f"127.0.0.1:{free_port(socket.SOCK_DGRAM)}", chain_url=anvil.url,
+            listen=f"127.0.0.1:{free_port(socket.SOCK_DGRAM, 2)}", chain_url=anvil.url,
         )
         anvil.fund(keys.operator.address, 1000)
         deployment = admin.deploy_contract(home, anvil.url, keys)
@@ -137,6 +137,25 @@ redis-server() {{ command redis-server "$@" --port {port}; }}
 """,
     )
     assert "PASSWORD" not in said
+
+
+def test_shards_on_two_machines(place: Path):
+    """Two homes, a copy each of the operator's, stand for two machines; both write to one contract."""
+    listen = load_server_config(OperatorHome(place / "operator").config).listen.port
+    (place / "robot/robot.toml").write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\nduration = "5s"\n')
+    said = type_page("howto-shards.md", place, marked="shards", ports={"7410": listen, "7411": listen + 1}, after="""
+rosbridge-eth robot
+for robot in robot_1 robot_3; do
+    until rosbridge-eth read $robot > $robot.jsonl && [ $(grep -c odom $robot.jsonl) -ge 50 ]; do sleep 1; done
+done
+rosbridge-eth status --json > first.json
+rosbridge-eth status --home second --json > second.json
+""")
+    assert said.count("Listening on UDP") == 2
+    for name, own, other in (("first", "robot_1", "robot_3"), ("second", "robot_3", "robot_1")):
+        report = json.loads((place / f"{name}.json").read_text())
+        assert report["process"] == [] and report["robots"][other]["chunks"] > 0
+        assert "waiting" in report["robots"][own] and "waiting" not in report["robots"][other]
 
 
 def test_watch(place: Path, require: Callable[[str], str]):

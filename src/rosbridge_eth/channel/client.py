@@ -64,10 +64,6 @@ def utc_now() -> datetime:
 class _Session:
     """The keys of an OFFER that holds, and what is sent and heard under them."""
 
-    __slots__ = (
-        "_cid", "began", "expires", "heard", "interval", "opens", "peer", "replay", "seals", "sending", "state",
-    )  # fmt: skip
-
     def __init__(self, agreed: Agreed, sending: Sending, now: float, lasts: float) -> None:
         self.peer, self._cid = agreed.peer, agreed.told
         self.seals, self.opens = Direction(agreed.secrets.client), Direction(agreed.secrets.server)

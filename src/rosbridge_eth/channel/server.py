@@ -19,7 +19,7 @@ from rosbridge_eth.channel.client import utc_now
 from rosbridge_eth.channel.events import Drop, End, Event, Refused, ServerConfig, close_frame, parse_close
 from rosbridge_eth.channel.handshake import Agreed, Randomness, answer_proof
 from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
-from rosbridge_eth.channel.transfer import ACK_DELAY, ACK_EVERY, NEVER, Early, Receiving
+from rosbridge_eth.channel.transfer import ACK_DELAY, ACK_EVERY, NEVER, Receiving
 from rosbridge_eth.channel.wire import Answer, Assembly, Frame, Hello, Kind, Malformed, Reason
 from rosbridge_eth.identity import Identity, Trust
 
@@ -39,8 +39,6 @@ def cookie_key(identity: Identity) -> bytes:
 class _Proof:
     """A PROOF of which pieces are missing, or that waits for time. size: bytes of its datagrams that came."""
 
-    __slots__ = ("assembly", "began", "size")
-
     def __init__(self, now: float) -> None:
         self.began, self.assembly, self.size = now, Assembly(), 0
 
@@ -51,19 +49,14 @@ class _Session:
     credit: how many bytes more came from there than went there.
     """
 
-    __slots__ = (
-        "_next_offer", "address", "began", "cid", "client_cid", "credit", "due", "heard", "number",
-        "offer", "opens", "peer", "pending", "receiving", "replay", "seals", "state", "told",
-    )  # fmt: skip
-
     def __init__(
-        self, agreed: Agreed, cid: bytes, key: tuple[Address, Hello], credit: int, now: float, early: Early
+        self, agreed: Agreed, cid: bytes, key: tuple[Address, Hello], credit: int, now: float, receiving: Receiving
     ) -> None:
         self.peer, self.cid, self.client_cid = agreed.peer, cid, key[1].client_cid
         self.address, self.credit = key[0], credit
         self.offer, self._next_offer = key[1].in_pieces(Kind.OFFER, b"", agreed.told), 0
         self.seals, self.opens = Direction(agreed.secrets.server), Direction(agreed.secrets.client)
-        self.replay, self.receiving = ReplayWindow(), Receiving(early)
+        self.replay, self.receiving = ReplayWindow(), receiving
         self.state = self.told = b""  # what the program says, and what of it went out last
         self.number = 0  # of the next packet
         self.began = self.heard = now
@@ -121,7 +114,6 @@ class Server:
         self._wall, self._randomness, self._stopwatch = wall, randomness or Randomness(), stopwatch
         self._cookies = Cookies(cookie_key, HANDSHAKE_LIFETIME)
         self._share = TokenBucket(config.handshake_share, SHARE_BURST, now)
-        self._early = Early(config.max_early)
         self._counts: Counter[str] = Counter()
         self._events: deque[Event] = deque()
         self._outbox: list[tuple[bytes, Address]] = []
@@ -173,8 +165,7 @@ class Server:
     def statistics(self) -> Counter[str]:
         """What was counted since this server was made, each Drop among it, and what is there at this moment."""
         half_open = len(self._proofs) + len(self._sessions) - len(self._by_name)
-        there = {"connections": len(self._by_name), "half_open": half_open, "early": self._early.kept}
-        return Counter({**self._counts, **there})
+        return Counter({"early": 0, **self._counts, "connections": len(self._by_name), "half_open": half_open})
 
     # What the network and the clock call
 
@@ -295,7 +286,8 @@ class Server:
             key[1], cookie, body, identity=self._identity, trust=self._trust, server_cid=cid,
             randomness=self._randomness, at=self._wall(),
         )  # fmt: skip
-        session = self._sessions[cid] = self._offered[key] = _Session(agreed, cid, key, credit, now, self._early)
+        receiving = Receiving(self._counts, self.config.max_early)
+        session = self._sessions[cid] = self._offered[key] = _Session(agreed, cid, key, credit, now, receiving)
         self._outbox += [(datagram, key[0]) for datagram in session.offers()]
 
     # Sessions
@@ -333,9 +325,13 @@ class Server:
             self._due.append((session.due, session))
 
     def _stand(self, session: _Session) -> None:
-        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced."""
-        if (older := self._by_name.get(session.peer.name)) is not None:
-            self._remove(older, End.REPLACED)
+        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced;
+        not one that was begun later, since that packet may have been held back."""
+        if (other := self._by_name.get(session.peer.name)) is not None:
+            if other.began > session.began:
+                self._remove(session, End.REPLACED)
+                raise Refused(Drop.UNEXPECTED)
+            self._remove(other, End.REPLACED)
         self._by_name[session.peer.name] = session
         self._counts["handshakes"] += 1
         self._events.append(events.Connected(session.peer, session.cid))

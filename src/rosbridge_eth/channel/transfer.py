@@ -199,30 +199,20 @@ class Sending:
             if self._unanswered == OUTAGE:
                 self._window.collapse()
             for index in islice(cycle(self._segments), PROBES):
-                self._carrier[index] = -1  # so that it does not go once more when its last packet counts as lost
                 heappush(self._again, index)
 
 
-class Early:
-    """How many segments all sessions of a process keep before their turn, and how many they may."""
-
-    __slots__ = ("kept", "limit")
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.kept = 0
-
-
 class Receiving:
-    """The receiving half. Whole messages are appended to `messages`, whose owner takes them out."""
+    """The receiving half. Whole messages are appended to `messages`, whose owner takes them out.
 
-    __slots__ = ("_all", "_arrived", "_early", "messages", "next")
+    counts["early"]: segments that all sessions of a process keep before their turn, of which there may be `limit`.
+    """
 
-    def __init__(self, early: Early) -> None:
+    def __init__(self, counts: Counter[str], limit: int) -> None:
         self.next = 0
         """The first segment that is missing."""
         self.messages: list[bytes] = []
-        self._all = early
+        self._counts, self._limit = counts, limit
         self._early: dict[int, bytes] = {}
         self._arrived = bytearray()  # the stream, from the beginning of the message that is not whole yet
 
@@ -234,17 +224,17 @@ class Receiving:
         if index >= self.next + SEGMENTS:
             raise Malformed("a segment beyond the limit")
         if index > self.next:
-            if len(self._early) >= RESERVED_SEGMENTS and self._all.kept >= self._all.limit:
+            if len(self._early) >= RESERVED_SEGMENTS and self._counts["early"] >= self._limit:
                 return False
             self._early[index] = data
-            self._all.kept += 1
+            self._counts["early"] += 1
             return True
         self._arrived += data
         self.next += 1
         while (more := self._early.pop(self.next, None)) is not None:
             self._arrived += more
             self.next += 1
-            self._all.kept -= 1
+            self._counts["early"] -= 1
         self._cut()
         return True
 
@@ -263,5 +253,5 @@ class Receiving:
 
     def release(self) -> None:
         """Give back what this session had of the process's room."""
-        self._all.kept -= len(self._early)
+        self._counts["early"] -= len(self._early)
         self._early.clear()

@@ -208,6 +208,6 @@ class Answer(NamedTuple):
         if stop > len(frame) or size > ACK_BITS // 8 or len(frame) - stop > MAX_STATE:
             raise Malformed("an answer ends early, or is too long")
         bits = int.from_bytes(frame[_ANSWER.size : stop], "big")
-        if not bits & 1 or bits.bit_length() > largest + 1:
-            raise Malformed("an answer without its largest packet, or of negative packet numbers")
+        if not bits & 1 or bits.bit_length() > largest + 1 or size != (bits.bit_length() + 7) // 8:
+            raise Malformed("an answer without its largest packet, of negative packet numbers, or with zeros behind")
         return Answer(largest, next_segment, time_ms, bits, frame[stop:])

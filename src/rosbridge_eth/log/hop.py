@@ -27,6 +27,8 @@ FORKED: Final = (
     " `revoke` it, `register --replace` it, and `join` the new bundle in a new folder, on one machine"
 )
 """Why nothing is taken of a log that forked, on both ends."""
+ELSEWHERE: Final = "this robot belongs to the server's shard at "
+"""Why a shard takes nothing of a robot that belongs to another one, whose HOST:PORT follows: the robot goes there."""
 
 
 class HopError(Exception):

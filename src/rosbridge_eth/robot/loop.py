@@ -17,6 +17,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TypeVar
@@ -26,7 +27,7 @@ from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, time_text
+from rosbridge_eth.config.values import Address, counted, parse_address, time_text
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
@@ -46,7 +47,7 @@ _T = TypeVar("_T")
 REPLAYED_BYTES = 4 << 20  # of raw messages between the source and the loop, where the source can wait
 LIVE_BYTES = 128 << 20  # and where it cannot: twice the largest message that is decoded
 TAKE = 128  # raw messages captured before the network gets its turn again
-GATHER = 0.04  # seconds that messages gather in the queue: a turn of the loop costs as much as some of them
+GATHER = 0.05  # seconds that messages gather in the queue: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
 LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
@@ -152,6 +153,9 @@ class Robot:
                     self._finish(now)
                 else:
                     self._spool_chunks([] if self._finished else self.writer.closed(now, time.time_ns() // 10**6), now)
+                if shard := self.sender.elsewhere:
+                    with suppress(ValueError):
+                        self.loop.go(parse_address(shard), now)
                 self.loop.seek(now)
                 self._send(now)
                 on_turn()

@@ -26,7 +26,7 @@ from rosbridge_eth.channel import (
     Unresolved,
 )  # fmt: skip
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk
-from rosbridge_eth.log.hop import FORKED, HopError, ServerState, encode_offer
+from rosbridge_eth.log.hop import ELSEWHERE, FORKED, HopError, ServerState, encode_offer
 from rosbridge_eth.log.store import NO_DIGEST, NOWHERE
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.spool import Spool
@@ -102,6 +102,12 @@ class Sender:
         """Whether another machine, or an older life of this one, has written into this robot's log."""
         return self.held == FORKED or self.refusal == TWICE
 
+    @property
+    def elsewhere(self) -> str:
+        """HOST:PORT of the shard to which this robot belongs, where the one that it asks says that it is another."""
+        head, _, shard = ("" if self.state is None else self.state.why).partition(ELSEWHERE)
+        return "" if head else shard
+
     # What comes
 
     def handle(self, event: Event, now: float) -> None:
@@ -142,7 +148,9 @@ class Sender:
         log.debug("stream %s: the server has it up to %d", state.head[:STREAM_SIZE].hex(),
                   int.from_bytes(state.head[STREAM_SIZE:], "big"))
         self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
-        if state.why:
+        if self.elsewhere:
+            log.info("%s", state.why)
+        elif state.why:
             self._warn(state.why, f"the server takes nothing at this moment: {state.why}", now)
 
     def _warn(self, why: str, text: str, now: float) -> None:

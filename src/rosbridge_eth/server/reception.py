@@ -27,7 +27,7 @@ from rosbridge_eth.channel.udp import UdpLoop
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.identity import PeerIdentity
 from rosbridge_eth.log.chunk import Altered, Chunk, ChunkError, Forged, Log, robot_id, verify
-from rosbridge_eth.log.hop import FORKED, HopError, ServerState, decode_offer
+from rosbridge_eth.log.hop import ELSEWHERE, FORKED, HopError, ServerState, decode_offer
 from rosbridge_eth.log.store import NO_DIGEST, Offer, Outcome, State, Store
 from rosbridge_eth.terminal import Trouble
 
@@ -76,14 +76,17 @@ class Reception:
 
     in_force: the robots that may have a session, by Tk, and keccak256 of their certificates in the operator's registry;
     asked once a second. Those that the contract has are in the store's state.
+    elsewhere: HOST:PORT of the shard to which a robot belongs, "" if to this one.
     counts: chunks by outcome; records: by robot's name, those stored; newest: when it sealed the last of them;
     forked: by robot's name, when its log was last seen to go on in two places.
     """
 
     def __init__(
         self, server: Server, store: Store, ledger: bytes, in_force: Callable[[], Mapping[bytes, bytes]],
+        elsewhere: Callable[[bytes], str] = lambda tk: "",
     ) -> None:  # fmt: skip
         self.server, self._store, self._ledger, self._in_force = server, store, ledger, in_force
+        self._elsewhere = elsewhere
         self.sessions: dict[bytes, Session] = {}
         self._gone: dict[str, Session] = {}  # by name: sessions that a newer one of the same identity replaced
         self._due: dict[bytes, Session] = {}  # those that sent something since the last commit
@@ -108,6 +111,8 @@ class Reception:
                     if now - self._said.get((peer.name, REPLACED), -NEVER) < SAY_AGAIN:
                         self._fork(session, now)
                     self._tell(session, REPLACED, now)
+                if shard := self._elsewhere(session.tk):
+                    session.why, session.until = ELSEWHERE + shard, NEVER
                 log.info("%s: session begun", peer)
                 self.look(now, [session])  # its handshake may have been allowed before the list changed
             case Disconnected(reason=reason, connection=connection):

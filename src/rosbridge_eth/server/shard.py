@@ -74,7 +74,12 @@ def open_reception(
     """What answers the robots of a shard."""
     channel = ServerConfig(modes=tuple(Mode[mode.upper()] for mode in config.channel))
     server = Server(channel, identity, server_trust(home, registry), cookie_key(identity), time.monotonic())
-    return Reception(server, store, home.deployment().ledger, registry.in_force)
+
+    def elsewhere(tk: bytes) -> str:
+        own = shard_of(tk, config.shards)
+        return "" if own == shard else str(config.addresses()[own])
+
+    return Reception(server, store, home.deployment().ledger, registry.in_force, elsewhere)
 
 
 def open_submitter(

@@ -461,3 +461,15 @@ def test_a_session_stands_until_the_new_one_is_finished():
     assert isinstance(heard, Message) and heard.payload == b"still here"
     second.to_server(confirmation)
     assert [type(event) for event in events(server)] == [Disconnected, Connected]
+
+
+def test_a_first_packet_that_was_held_back_replaces_no_session_that_was_begun_later():
+    first = Steps()
+    server, held = first.server, first.until_first()
+    second = Steps(server=server, now=1001.0).until_connected()
+    events(server)
+    assert second.to_server(held) == [] and events(server) == []
+    assert dropped(server) == {Drop.UNEXPECTED: 1}
+    second.to_server(*second.sent(b"still here"))
+    assert [event.payload for event in events(server)] == [b"still here"]
+    assert server.statistics().items() >= {("connections", 1), ("half_open", 0)}

@@ -368,6 +368,7 @@ def test_a_packet_held_back_and_sent_later_from_elsewhere_is_no_move():
     steps.to_server(*steps.sent(b"newer"))
     credit = steps.session.credit
     steps.server.receive_datagram(held, ELSEWHERE, steps.now)
+    assert steps.server.address_of(steps.connection) == HERE
     assert steps.session.credit <= credit  # what came from elsewhere pays for nothing here
     assert all(address == HERE for _, address in steps.server.datagrams_to_send(steps.now))
     heard = [e.payload for e in events(steps.server)]

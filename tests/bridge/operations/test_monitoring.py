@@ -233,8 +233,8 @@ def site(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]
     for program in ("npx", "redis-server", "prometheus", "promtool"):
         require(program)
     made = Site(tmp_path_factory.mktemp("site"))
-    made.ports = {name: free_port() for name in ("anvil", "redis", "monitor", "prometheus", "robot")}
-    made.ports["door"] = free_port(socket.SOCK_DGRAM)
+    made.ports = {name: free_port() for name in ("anvil", "redis", "prometheus", "robot")}
+    made.ports |= {"monitor": free_port(count=2), "door": free_port(socket.SOCK_DGRAM, 2)}
     for folder in ("bin", "chain", "run/secrets", "redis", "prometheus"):
         (made.path / folder).mkdir(parents=True)
     (made.path / "bin/rosbridge-eth").write_text(
@@ -255,6 +255,8 @@ def site(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]
                  for name, value in SERVICES["setup"]["environment"].items()}  # fmt: skip
         for _ in range(2):  # run again, it finds what is there
             made.do("sh", str(script), environment=words)
+        settings = made.path / "operator/server.toml"
+        settings.write_text(settings.read_text().replace("\n[chain]", "\nshards = 2\n[chain]"))
         made.start("server", ["rosbridge-eth", *SERVICES["server"]["command"]])
         made.until("the server is ready", lambda: made.get("monitor", "/metrics"))
         made.do("rosbridge-eth", "join", "--name", "robot_1", "--source", "sim", "--topic", "/robot_1/odom")
@@ -265,7 +267,9 @@ def site(tmp_path_factory: pytest.TempPathFactory, require: Callable[[str], str]
         made.start("robot", ["rosbridge-eth", "robot"])
         shutil.copytree(DEPLOY / "prometheus", made.path / "etc/prometheus")
         config = made.path / "etc/prometheus/prometheus.yml"
-        config.write_text(made.here(config.read_text()).replace("_interval: 5s", "_interval: 1s"))
+        first, second = (f'"127.0.0.1:{made.ports["monitor"] + shard}"' for shard in range(2))
+        config.write_text(made.here(config.read_text()).replace("_interval: 5s", "_interval: 1s").replace(
+            first, f"{first}, {second}"))
         (config.parent / "robots.yml").write_text(f'- targets: ["127.0.0.1:{made.ports["robot"]}"]\n')
         made.do("promtool", "check", "config", str(config))
         made.start("prometheus", ["prometheus", *map(made.here, SERVICES["prometheus"]["command"]),
@@ -293,7 +297,7 @@ def test_every_panel_shows_what_there_is(site: Site):
         family.name for port in ("monitor", "robot")
         for family in text_string_to_metric_families(site.get(port, "/metrics")) if family.samples
     }  # fmt: skip
-    quiet = {"rosbridge_eth_lost", "rosbridge_eth_datagrams_dropped"}  # have a label for each kind that happened
+    quiet = {f"rosbridge_eth_{name}" for name in ("lost", "datagrams_dropped", "forked_seconds")}  # as they happen
     assert {metric.name for metric in REGISTRY.collect()} - shown <= quiet
     for panel in PANELS:
         for target in panel["targets"]:
@@ -315,8 +319,27 @@ def test_the_rules_are_taken_and_find_nothing_wrong_with_what_is_well(site: Site
     assert [rule["name"] for group in groups for rule in group["rules"]] == [rule["alert"] for rule in RULES]
     fires = {rule["alert"] for rule in RULES if site.ask(rule["expr"])}
     assert fires <= {"Triggered", "HeadStands"}, "the robot's own event; anvil makes a block when there is something"
-    down = site.ask("up == 0")
-    assert down == []
+    assert site.ask("up == 0") == []
+    assert len(site.ask('up{job="rosbridge-eth-server"}')) == 2, "of each shard"
+
+
+@pytest.mark.service
+@pytest.mark.slow
+def test_a_shard_that_was_killed_is_seen(site: Site):
+    """While the parent does not start it again."""
+    [ready] = [panel["targets"][0]["expr"] for panel in PANELS if panel["title"] == "Server ready"]
+    [alarm] = [rule["expr"] for rule in RULES if rule["alert"] == "NotAnswering"]
+    events = map(json.loads, (site.path / "server.log").read_text().splitlines())
+    pid = next(int(event["event"].rpartition(" ")[2]) for event in events if "shard-1 started" in event["event"])
+    assert site.ask(ready)[0]["value"][1] == "1"
+    site.processes["server"].send_signal(signal.SIGSTOP)
+    try:
+        os.kill(pid, signal.SIGKILL)
+        site.until("the alarm", lambda: site.ask(alarm))
+        assert site.ask(ready)[0]["value"][1] == "0"
+    finally:
+        site.processes["server"].send_signal(signal.SIGCONT)
+    site.until("it is started again", lambda: site.ask(ready)[0]["value"][1] == "1")
 
 
 @pytest.mark.service
