@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
-"""Topics of ROS itself; they are taken only where they are named."""
 TAKEN_WITHIN = 10.0  # seconds for a running robot to see what `trigger` asks for; it looks once a second
 
 
@@ -84,15 +83,13 @@ def _first_config(place: RobotHome, source: str | None, topics: list[str], *, as
     """A robot.toml of what is given, found and chosen."""
     if not (asks or yes or source or topics):
         return bundles.FIRST_CONFIG
-    try:
-        found = str(ANYTHING.source_and_why(os.environ)[0].kind)
-    except ConfigError:
-        if source is None and not asks:
-            raise
-        found = "sim"
     if source is None:
-        asked = "Messages come from (ros1, ros2, sim, a ROS 1 master's URI, or a bag)"
-        source = str(typer.prompt(asked, default=found, err=True)) if asks else found
+        source = "sim"
+        with suppress(ConfigError) if asks else nullcontext():  # who is asked need not have ROS
+            source = str(ANYTHING.source_and_why(os.environ)[0].kind)
+        if asks:
+            asked = "Messages come from (ros1, ros2, sim, a ROS 1 master's URI, or a bag)"
+            source = str(typer.prompt(asked, default=source, err=True))
     config = parse_config(RobotConfig, robot_toml(topics or ["**"], source), place.config)
     if not topics or isinstance(config.source, BagConfig | SimConfig):  # which will not offer more
         with closing(everything(config)) as opened:
@@ -226,13 +223,12 @@ def trigger(
 
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
-    figures = metrics.running(home).get("robot")
-    if figures is None:
+    if (figures := metrics.running(home).get("robot")) is None:
         raise nobody
     known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]
-    if not known or (name is not None and name not in known):
-        raise ConfigError(f"the robot has no trigger{f' {name}' if name else ''}; it has: {', '.join(known) or 'none'}")
     wanted = known if name is None else [name]
+    if not wanted or name not in (None, *known):
+        raise ConfigError(f"the robot has no trigger {name or 'at all'}; it has: {', '.join(known) or 'none'}")
     for each in wanted:
         place.event(each).touch()
     deadline = time.monotonic() + TAKEN_WITHIN

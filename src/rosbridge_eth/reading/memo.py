@@ -1,4 +1,5 @@
-"""Facts that a reader need not prove twice: that a signature holds, and the key that a grant unwraps to.
+"""Facts that a reader need not prove twice: that a signature holds, and the key that a header wraps
+for this reader, or that it wraps none.
 
 Both follow from the chunk's bytes and a key alone, and stay true whatever a node says. Registrations, places, blocks
 and times are a node's word: they are not here, and are asked for at every reading.

@@ -9,6 +9,7 @@ messages, and the findings, of which so many are kept. docs/reading.md has the o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -347,12 +348,14 @@ class Verifier:
             if self._reader is None:
                 raise NoGrant(f"{header} is opened with a reader's key")
             name = sm3.digest(b"content key" + self._reader.public_key.to_bytes() + header.encoded)
-            known = self._facts and self._facts.get(name)
-            if known:
-                return known
-            key, self._grant = unwrap(header, self._reader, self._grant)
-            if self._facts is not None:
-                self._facts[name] = key
+            key = None if self._facts is None else self._facts.get(name)
+            if key is None:
+                with suppress(NoGrant):
+                    key, self._grant = unwrap(header, self._reader, self._grant)
+                if self._facts is not None:
+                    self._facts[name] = key or b""
+            if not key:
+                raise NoGrant(f"{header} was not granted to this reader")
             return key
         except NoGrant:
             if header.digest not in self._granted:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 import typer
 
@@ -77,10 +77,6 @@ def offered(source: Source) -> list[Offer]:
     return offers
 
 
-Line: TypeAlias = tuple[float, bytes]
-"""When it was captured, and the line."""
-
-
 @dataclass(slots=True)
 class Heard:
     """A topic: when its messages came (ns since 1970), their bytes, and the lines they were captured as."""
@@ -88,7 +84,7 @@ class Heard:
     offer: Offer
     times: list[int] = field(default_factory=list)
     size: int = 0
-    lines: list[Line] = field(default_factory=list)
+    lines: list[tuple[float, bytes]] = field(default_factory=list)  # when it was captured (s), and the line
     trigger: str | None = None
 
     @property
@@ -98,7 +94,7 @@ class Heard:
         return (len(self.times) - 1) * 1e9 / span if span > 0 else None
 
     @property
-    def all_day(self) -> list[Line]:
+    def all_day(self) -> list[tuple[float, bytes]]:
         """The lines of a topic that comes again and again."""
         return self.lines if self.rate and not self.trigger else []
 
@@ -112,24 +108,21 @@ def survey(
     """
     from rosbridge_eth.ledger.contract import GAS_A_BYTE, set_data_cost
 
-    source, stop, taking, room = everything(config), threading.Event(), threading.Lock(), [ENOUGH]
+    source, stop, one_thread, room = everything(config), threading.Event(), threading.Lock(), [ENOUGH]
     timer = threading.Timer(seconds, stop.set)
     capture = Capture([*config.rules(), TopicRule("**")], source_kind=source.kind, live=True)
 
     def take(raw: RawMessage) -> None:
-        with taking:
-            listen(raw)
-
-    def listen(raw: RawMessage) -> None:
-        topic = heard.setdefault(raw.topic, Heard(Offer(raw.topic, raw.type_name)))
-        topic.times.append(raw.received_ns)
-        topic.size += len(raw.raw)
-        if record := capture.process(raw, raw.received_ns):
-            topic.trigger = record.trigger
-            topic.lines.append((raw.received_ns / 1e9, record.line))
-            room[0] -= len(record.line)
-        if room[0] < 0:
-            stop.set()
+        with one_thread:  # at a time
+            topic = heard.setdefault(raw.topic, Heard(Offer(raw.topic, raw.type_name)))
+            topic.times.append(raw.received_ns)
+            topic.size += len(raw.raw)
+            if record := capture.process(raw, raw.received_ns):
+                topic.trigger = record.trigger
+                topic.lines.append((raw.received_ns / 1e9, record.line))
+                room[0] -= len(record.line)
+            if room[0] < 0:
+                stop.set()
 
     try:
         heard = {offer.topic: Heard(offer) for offer in offered(source)}
@@ -164,7 +157,7 @@ def survey(
     }  # fmt: skip
 
 
-def _sealed(lines: list[Line], config: RobotConfig, kind: str, readers: int) -> list[Chunk]:
+def _sealed(lines: list[tuple[float, bytes]], config: RobotConfig, kind: str, readers: int) -> list[Chunk]:
     """The chunks that a robot would make of these lines, for so many readers."""
     if not lines:
         return []

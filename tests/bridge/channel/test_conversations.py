@@ -347,6 +347,7 @@ def test_a_quiet_session_is_probed_after_one_second_then_two_up_to_ten():
     ServerProgram(network)
     robot = RobotProgram(network, [])
     assert network.run(lambda: robot.sent is not None)
+    network.run(lambda: False, limit=60.0)  # quiet before, too
     sent: list[float] = []
     network.watch = lambda data, source, target: sent.append(network.now) if target == SERVER_ADDRESS else None
     robot.messages.append(b"the last")

@@ -27,6 +27,7 @@ from rosbridge_eth.identity import load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.log.chunk import robot_id
+from rosbridge_eth.log.hop import FORKED
 from rosbridge_eth.log.store import NOWHERE, Offer
 from rosbridge_eth.operator import doctor
 from rosbridge_eth.operator import enrolment as admin
@@ -420,6 +421,30 @@ def test_a_running_robot_shows_its_figures(place: Place, capsys: Capture):
         report = status(capsys, "--home", "robot")
         assert "robot: robot has a session" in report["process"]
         assert report["figures"]["captured"] == 0 and "spool_chunks not stored" in report["figures"]
+    finally:
+        robot.spool.close()
+        robot.loop.close()
+
+
+def test_a_log_that_goes_on_in_two_places_is_an_alarm_on_both_ends(place: Place, capsys: Capture):
+    now, report = time.time(), status(capsys)
+    metrics.BEAT.labels("shard-0").set(now)
+    for age, told in ((700.0, False), (5.0, True)):
+        metrics.FORKED.labels("robot_1").set(now - age)
+        metrics.save(metrics.file_of(place.operator.path, "shard-0"))
+        report = status(capsys)
+        assert (f"ALARM: robot_1: {FORKED}" in report["alarms"]) == told
+    place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
+    metrics.FORKED.clear()
+    robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+    try:
+        for held in ("", FORKED):
+            robot.sender.held = held
+            metrics.show_robot("robot_1", robot, time.time())
+            metrics.save(metrics.file_of(place.robot.path, "robot"))
+            assert status(capsys, "--home", "robot")["alarms"] == ([f"ALARM: {FORKED}"] if held else [])
+        assert run(["status", "--home", "robot"]) == 0
+        assert FORKED in " ".join(capsys.readouterr().out.split())
     finally:
         robot.spool.close()
         robot.loop.close()

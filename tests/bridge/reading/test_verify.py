@@ -477,9 +477,13 @@ def test_a_reader_who_comes_behind_others_tries_all_grants_once(monkeypatch):
         return unwrap(header, key, likely)
 
     monkeypatch.setattr(verify, "unwrap", asking)
-    pen = Pen(readers=[reader("insurer"), reader()])
-    assert read(pen.chunks(3)).verdict.sound
+    pen, facts = Pen(readers=[reader("insurer"), reader()]), dict[bytes, bytes]()
+    chunks = pen.chunks(3)
+    assert read(chunks).verdict.sound
     assert asked == [0, 1, 1]
+    for _ in range(2):
+        assert read(chunks, key=reader("stranger"), facts=facts).only(Kind.NO_GRANT).count == 3
+    assert asked == [0, 1, 1, 0, 0, 0], "that it was granted nothing is a fact, too"
 
 
 def test_a_root_that_is_not_the_records(monkeypatch):
