@@ -10,6 +10,7 @@ in the JSON file, so that parts can be measured one by one; the page and the pic
     poa, pow     every client registers once, writes four times and asks four times, by number of clients
     bridge-poa   from `init` to a proven read, four robots as in the paper
     bridge-pow   the same by proof of work, and a reorganisation by two miners that were cut from each other
+    latency      from capture to store and chain, through networks that lose and delay (latency.py)
     baseline     the same records into an ordinary replicated log with an anchor on the chain (baseline.py)
     scale        the model of scale.py, with the costs that are measured here
 
@@ -41,6 +42,7 @@ import baseline
 import bridge_costs
 import chain_interaction
 import geth_network
+import latency
 import load
 import paper_page
 import scale
@@ -271,6 +273,7 @@ def main() -> None:
         "bridge-poa": lambda: bridge("poa", quick, None),
         "pow": lambda: interaction("pow", quick, dag),
         "bridge-pow": lambda: bridge("pow", quick, dag),
+        "latency": lambda: latency.measure(quick),
         "baseline": lambda: baseline.measure(quick),
         "scale": lambda: scale.measure(quick),
     }

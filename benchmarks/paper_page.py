@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 
 import baseline
+import latency
 import scale
 
 matplotlib.use("Agg")
@@ -22,7 +23,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # 
 PAPER = {300: (2994, 2993, 186.34), 500: (4986, 4986, 249.88), 700: (6991, 6991, 370.29)}
 """By clients: received, on the chain, ms of decryption in 8 processes."""
 CHAINS = {"poa": "proof of authority", "pow": "proof of work"}
-PARTS = ("user", "server", "poa", "bridge-poa", "pow", "bridge-pow", "baseline", "scale")
+PARTS = ("user", "server", "poa", "bridge-poa", "pow", "bridge-pow", "latency", "baseline", "scale")
 Figures = Mapping[str, Any]
 
 
@@ -162,7 +163,7 @@ def page(figures: Figures) -> str:
     sections = [_head(figures)]
     for name, make in (
         ("user", _user_section), ("server", _server_section), ("chain", _chain_section), ("bridge", _bridge_section),
-        ("baseline", _baseline_section), ("scale", _scale_section),
+        ("latency", _latency_section), ("baseline", _baseline_section), ("scale", _scale_section),
     ):  # fmt: skip
         if name in figures or name in ("chain", "bridge"):
             sections.append(make(figures))
@@ -332,6 +333,24 @@ two in a million, with a third two in ten thousand. So N follows from the share 
 network where one miner may be cut from the others for a while, from how many blocks it makes meanwhile. One
 that is deeper is healed by the same rule, for a day; what was told as confirmed was wrong in between."""
     return text
+
+
+def _latency_section(figures: Figures) -> str:
+    part = figures["latency"]
+    head = ["loss each way, round trip", "until", *(name for name, _ in latency.SHARES), "mean"]
+    rows = [
+        (f"{row['loss']:.0%}, {2000 * row['delay']:.0f} ms", what, *(f"{value:.2f}" for value in row[what].values()))
+        for row in part["rows"] for what in ("stored", "confirmed")
+    ]  # fmt: skip
+    return f"""## From capture to store and chain
+
+{part["messages"]:,} messages at {part["pace"]:.0f} a second through a relay that loses and delays, in seconds from the
+moment at which the source hands a message out until the robot is told that the server has stored it, or that the chain
+has it ([benchmarks/latency.py](../benchmarks/latency.py)). A chunk is closed a second after its first message, so half
+a second is the least mean there can be; anvil makes a block at once, so that of another chain is to be added. The first
+messages wait for the session, too.
+
+{table(head, rows)}"""
 
 
 GIVES = (

@@ -43,8 +43,8 @@ def test_nothing_is_lost_doubled_or_refused(written: Path) -> None:
 def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> None:
     page = (written / "evaluation.md").read_text()
     for heading in (
-        "User end", "Blockchain end", "Chain interaction", "The bridge on both networks", "Beside an ordinary",
-        "Past this",
+        "User end", "Blockchain end", "Chain interaction", "The bridge on both networks", "From capture",
+        "Beside an ordinary", "Past this",
     ):  # fmt: skip
         assert f"## {heading}" in page
     pictures = [line.partition("](")[2].rstrip(")") for line in page.splitlines() if line.startswith("![")]

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from operator import itemgetter
 from typing import Any, Final
 
@@ -34,7 +34,7 @@ from eth_hash.auto import keccak
 from redis.backoff import NoBackoff
 from redis.cluster import RedisCluster
 from redis.connection import parse_url
-from redis.exceptions import ClusterError, NoPermissionError, OutOfMemoryError, RedisClusterException
+from redis.exceptions import ClusterError, OutOfMemoryError, RedisClusterException
 from redis.retry import Retry
 
 from rosbridge_eth.errors import StoreError
@@ -140,10 +140,10 @@ _SETTINGS: Final = {
 }
 """Without any one of these Redis may lose what it has confirmed."""
 COMMANDS: Final = {
-    "eval": ("return 1", 0), "config|get": ("appendonly",), "info": ("server",), "time": (), "hset": ("K", "f", 1),
-    "hget": ("K", "f"), "hmget": ("K", "f"), "hdel": ("K", "f"), "zadd": ("K", 0, "m"), "zrem": ("K", "m"),
-    "zrangebylex": ("K", "-", "+"), "zrevrange": ("K", 0, 0), "zremrangebyrank": ("K", 0, 0), "sadd": ("K", "m"),
-    "smembers": ("K",), "del": ("K",),
+    "multi": (), "exec": (), "eval": ("return 1", 0), "config|get": ("appendonly",), "info": ("server",), "time": (),
+    "hset": ("K", "f", 1), "hget": ("K", "f"), "hmget": ("K", "f"), "hdel": ("K", "f"), "zadd": ("K", 0, "m"),
+    "zrem": ("K", "m"), "zrangebylex": ("K", "-", "+"), "zrevrange": ("K", 0, 0), "zremrangebyrank": ("K", 0, 0),
+    "sadd": ("K", "m"), "smembers": ("K",), "del": ("K",),
 }  # fmt: skip
 """Every command that is used here and in the scripts, with arguments to try the right to it; K: a key of its own, which
 the last one removes."""
@@ -202,8 +202,8 @@ class RedisStore(Store):
             )
         scripts = [(_APPEND, 2, tk, [self.max_bytes_per_robot, *(part for row in rows for part in row)])
                    for tk, rows in calls.items()]  # fmt: skip
-        letters: dict[bytes, Iterator[str]] = {}
-        for (tk, rows), answer in zip(calls.items(), self._run(scripts), strict=True):
+        letters = dict[bytes, Iterator[str]]()
+        for (tk, rows), answer in zip(calls.items(), self._run(scripts) if scripts else [], strict=True):
             letters[tk] = iter("F" * len(rows) if isinstance(answer, OutOfMemoryError) else answer.decode())
         return [_OUTCOMES[next(letters[tk])] for tk, _, _ in offers]
 
@@ -221,17 +221,23 @@ class RedisStore(Store):
         An append for which Redis has no memory answers OutOfMemoryError.
         """
         with self._talking():
-            pipe = self._redis.pipeline(transaction=False)
-            for _, _, tk, _ in scripts:
-                pipe.sadd(self._prefix + "robots", tk)
-            for script, keys, tk, arguments in scripts:
-                names = [self._key(kind, tk) for kind in ("log", "rows", "dead")[:keys]]
-                pipe.execute_command("EVAL", script, keys, *names, *arguments)
-            answers: list[Any] = pipe.execute(raise_on_error=False)
+            with suppress(OutOfMemoryError):
+                self._redis.sadd(self._prefix + "robots", *(tk for _, _, tk, _ in scripts))
+            try:  # as a transaction it is one fsync, where Redis makes one for every 16 KiB that it reads
+                answers = self._piped(scripts, transaction=len(scripts) > 1 and not self._cluster)
+            except OutOfMemoryError:  # it is refused whole; each script begins as it has to for this
+                answers = self._piped(scripts, transaction=False)
             for answer in answers:
                 if isinstance(answer, Exception) and not isinstance(answer, OutOfMemoryError):
                     raise answer
-        return answers[len(scripts) :]
+        return answers
+
+    def _piped(self, scripts: Sequence[tuple[str, int, bytes, Sequence[Any]]], *, transaction: bool) -> list[Any]:
+        pipe = self._redis.pipeline(transaction=transaction)
+        for script, keys, tk, arguments in scripts:
+            names = [self._key(kind, tk) for kind in ("log", "rows", "dead")[:keys]]
+            pipe.execute_command("EVAL", script, keys, *names, *arguments)
+        return list(pipe.execute(raise_on_error=transaction))
 
     # What looks
 
@@ -356,7 +362,7 @@ class RedisStore(Store):
             with self._talking():
                 node.execute_command(*name.split("|"), *arguments)
         except StoreError as error:
-            if isinstance(error.__context__, NoPermissionError):
+            if "this user has no permissions" in str(error):
                 return "~rosbridge-eth:*" if "keys" in str(error) else f"+{name}"
             if not isinstance(error.__context__, redis.ResponseError):  # that would be about the arguments
                 raise

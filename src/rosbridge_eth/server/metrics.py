@@ -84,7 +84,7 @@ KEPT = _gauge("trigger_records", "Records in memory for the next event.", "robot
 KEPT_BYTES = _gauge("trigger_bytes", "Bytes that these count, of the trigger's `memory`.", "robot", "trigger")
 SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored there, set aside.", "robot", "state")
 SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.", "robot")
-SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave up since it was made.", "robot")
+SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave up since the start.", "robot")
 CONNECTED = _gauge("connected", "1 while a session with the server stands.", "robot")
 
 
