@@ -21,7 +21,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 
 QUICK = (
-    "smcrypto/test_contract.py", "smcrypto/test_sm3.py", "smcrypto/sm2", "smcrypto/sm4", "bridge/log", "bridge/config",
+    "smcrypto/test_contract.py", "smcrypto/test_sm3.py", "smcrypto/sm2", "smcrypto/sm4", "bridge/config",
+    "bridge/log/test_chunk", "bridge/log/test_proof", "bridge/log/test_vectors", "bridge/log/test_writer",
     "bridge/capture", "bridge/test_demo.py",
 )  # fmt: skip
 """What `-m quick` runs: the standards' vectors, the chunk, capture and the whole path once; no server is needed."""

@@ -451,7 +451,7 @@ class StoreConfig(Section):
 
     url: `"sqlite"`, a file for each shard in the server's folder, or the URL of a Redis, which all shards share.
 
-    max_size: Bytes that a shard keeps in its file, dead letters included; a Redis has its own `maxmemory`.
+    max_size: Bytes of chunks that a shard keeps in its file; dead letters come on top. A Redis has its own `maxmemory`.
 
     share: Bytes of one robot. Above it, that robot waits, and no other.
     """
