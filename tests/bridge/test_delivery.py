@@ -110,8 +110,10 @@ class Machine:
             self.spool.append(chunk)
 
     def chunks(self) -> list[Chunk]:
-        """What is on its disk, to be sent."""
-        return [Chunk.parse(self.spool.chunks([row.place])[0]) for row in self.spool.rows(NOWHERE, 10_000)]
+        """What is on its disk and not confirmed; the newest confirmed one stays, since it shows a fork."""
+        count = self.spool.statistics().chunks
+        rows = self.spool.rows(NOWHERE, 10_000)[-count:] if count else []
+        return [Chunk.parse(self.spool.chunks([row.place])[0]) for row in rows]
 
 
 class World:

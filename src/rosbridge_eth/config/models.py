@@ -311,8 +311,8 @@ class RobotConfig(Section):
 
     nodes: Nodes to watch, by name or pattern: the topics they publish, resolved again every few seconds.
 
-    server: The server's HOST:PORT; without it, the one in the bundle the robot joined with. A name is asked for again
-    while there is no session.
+    server: HOST:PORT of the robot's shard of the server, or of any, which names the right one; without it, those in the
+    bundle the robot joined with. A name is asked for again while there is no session.
 
     channel: How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.
 

@@ -17,17 +17,21 @@ from typing import Any
 import pytest
 
 import rosbridge_eth
-from bridge.operations.conftest import Place
-from rosbridge_eth.channel.udp import server_socket
+from bridge.operations.conftest import PASSPHRASE, PASSWORD, Place
+from rosbridge_eth.channel.udp import UdpLoop, server_socket
 from rosbridge_eth.cli import run
-from rosbridge_eth.config import Address
-from rosbridge_eth.config.home import shard_of
+from rosbridge_eth.config import Address, load_robot_config, load_server_config
+from rosbridge_eth.config.home import BridgeEnd, shard_of
 from rosbridge_eth.errors import ConfigError, ExitCode, NetworkError, StoreError
 from rosbridge_eth.log.chunk import Log, robot_id
+from rosbridge_eth.operator.enrolment import load_server_identity
+from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.robot.loop import open_robot
 from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server import metrics, parent
 from rosbridge_eth.server.parent import FIRST_PAUSE, LONG_LIFE, LONGEST_PAUSE, Child, Parent, notify
-from rosbridge_eth.server.shard import Shard, submit
+from rosbridge_eth.server.reception import Worker
+from rosbridge_eth.server.shard import Shard, open_reception, open_store, submit
 
 SECRETS: Any = None
 
@@ -244,3 +248,41 @@ def test_a_child_ends_when_it_is_asked_to_and_says_by_its_code_why_it_ended_else
     os.kill(pid, signal.SIGTERM)
     out, _ = process.communicate(timeout=40)
     assert ends in out and "the parent's own" not in out
+
+
+def test_a_robot_that_asks_another_shard_is_sent_to_its_own_and_to_the_first_where_nobody_answers(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+):
+    """robot_1 belongs to shard 0 of 2; it is told of one that is no more, then asks shard 1."""
+    monkeypatch.setattr("rosbridge_eth.channel.udp.ASK_AGAIN", 1.0)
+    socks = [server_socket(Address("127.0.0.1", 0)) for _ in range(3)]
+    addresses = [Address(*sock.getsockname()[:2]) for sock in socks]
+    socks[2].close()
+    names = ", ".join(f'"{address}"' for address in addresses[:2])
+    place.configure('public = "127.0.0.1:9"', f"public = [{names}]\nshards = 2")
+    place.configure('"127.0.0.1:0"', '"127.0.0.1:7410"')
+    config, registry = load_server_config(place.operator.config), Registry(place.operator.registry)
+    identity = load_server_identity(place.operator, PASSPHRASE)
+    stop, workers = threading.Event(), []
+    for shard in range(2):
+        reception = open_reception(
+            config, identity, place.operator, registry, open_store(config, place.operator, shard), shard
+        )
+        workers.append(Worker(reception, lambda handle, at=shard, of=reception: UdpLoop(of.server, socks[at], handle)))
+    threads = [threading.Thread(target=worker.run, args=(stop.is_set,)) for worker in workers]
+    for thread in threads:
+        thread.start()
+    place.robot.config.write_text(
+        'topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\nduration = "2s"\nspeed = "max"\n'
+    )
+    monkeypatch.setattr(BridgeEnd, "addresses", lambda end: (addresses[2], addresses[1]))
+    try:
+        robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+        robot.run()
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join(10)
+    assert "nothing waits for the server" in robot.summary
+    assert [worker.reception.records["robot_1"] > 20 for worker in workers] == [True, False]
+    assert workers[1].reception.server.statistics()["handshakes"] == 1
