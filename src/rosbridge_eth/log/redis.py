@@ -147,6 +147,8 @@ COMMANDS: Final = {
 }  # fmt: skip
 """Every command that is used here and in the scripts, with arguments to try the right to it; K: a key of its own, which
 the last one removes."""
+CLUSTER_COMMANDS: Final[dict[str, tuple[Any, ...]]] = {"cluster|slots": (), "command": ()}
+"""Those that a cluster needs besides."""
 _URL_PARTS: Final = frozenset({
     "connection_class", "db", "host", "password", "path", "port", "username",
     "ssl_ca_certs", "ssl_ca_path", "ssl_cert_reqs", "ssl_certfile", "ssl_check_hostname", "ssl_keyfile",
@@ -173,6 +175,7 @@ class RedisStore(Store):
         # No retries: the caller decides what follows a call whose answer was lost. Any: answers have no types.
         one = redis.Redis(connection_pool=redis.ConnectionPool(**parts, **settings, retry=Retry(NoBackoff(), 0)))
         self._redis: Any = one
+        self._cluster = False
         self._where = _where(one)
         try:
             with self._talking():
@@ -181,7 +184,7 @@ class RedisStore(Store):
                     one.close()
                     self._redis = RedisCluster.from_url(url, **settings, retry=Retry(NoBackoff(), 1))
         except StoreError as error:
-            if isinstance(error.__context__, redis.ResponseError):
+            if isinstance(error.__context__, (redis.ResponseError, RedisClusterException)):
                 self._require_rights(one)
             self.close()
             raise
@@ -348,16 +351,17 @@ class RedisStore(Store):
                 )
 
     def _require_rights(self, node: Any) -> None:
-        missing = dict.fromkeys(right for name in COMMANDS if (right := self._lacks(node, name)))
+        names: dict[str, tuple[Any, ...]] = COMMANDS | (CLUSTER_COMMANDS if self._cluster else {})
+        missing = dict.fromkeys(right for name in names if (right := self._lacks(node, name, names[name])))
         if missing:
             raise StoreError(
                 f"{_where(node)}: its user lacks rights; in redis-cli: ACL SETUSER {self._user} {' '.join(missing)}"
                 " (docs/howto-redis.md)"
             )
 
-    def _lacks(self, node: Any, name: str) -> str | None:
+    def _lacks(self, node: Any, name: str, given: Sequence[Any]) -> str | None:
         """What the user lacks to use a command, as ACL SETUSER takes it."""
-        arguments = (self._prefix + "check" if part == "K" else part for part in COMMANDS[name])
+        arguments = (self._prefix + "check" if part == "K" else part for part in given)
         try:
             with self._talking():
                 node.execute_command(*name.split("|"), *arguments)

@@ -446,6 +446,25 @@ def test_a_cluster_of_which_one_node_may_lose_chunks_is_refused(cluster):
 # --- rights
 
 
+@pytest.mark.parametrize("name", ["cluster|slots", "command", "zadd"])
+def test_the_rights_for_a_cluster_are_those_of_the_page_and_each_that_is_missing_is_named(redis_cluster, name):
+    assert "`+cluster|slots +command` besides" in HOWTO.read_text(encoding="utf-8")
+    url = redis_cluster.url.replace("redis://", "redis://bridge:PASSWORD@")
+    for node in redis_cluster.nodes:
+        with node.client() as client:
+            client.execute_command("ACL", "SETUSER", "bridge", "reset")
+            client.execute_command(*documented_acl())
+            client.execute_command("ACL", "SETUSER", "bridge", "+cluster|slots", "+command")
+    store = open_url(url, name.encode().ljust(32))
+    use_everything(store)
+    store.close()
+    for node in redis_cluster.nodes:
+        with node.client() as client:
+            client.execute_command("ACL", "SETUSER", "bridge", f"-{name}")
+    with pytest.raises(StoreError, match=rf"ACL SETUSER bridge \+{re.escape(name)} \("):
+        open_url(url).check()
+
+
 def documented_acl() -> list[str]:
     command = re.search(r"ACL SETUSER .*?(?=\nrosbridge-eth)", HOWTO.read_text(encoding="utf-8"), re.DOTALL)
     assert command is not None
