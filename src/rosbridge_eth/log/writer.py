@@ -67,7 +67,7 @@ class LogWriter:
         self._defined: dict[str, bytes] = {}  # what the stream said last of a type
         self._begun = self._now
 
-    def take_up(self, readers: Sequence[sm2.PublicKey]) -> None:
+    def change_readers(self, readers: Sequence[sm2.PublicKey]) -> None:
         """Seal the next chunk, and all after it, for these; definitions are said again, for who reads from there on."""
         if self._readers != tuple(readers):
             self._readers = tuple(readers)

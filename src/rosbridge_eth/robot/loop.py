@@ -97,13 +97,13 @@ class Robot:
         self._stop.set()
         self.loop.wake()
 
-    def take_up(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
+    def reload(self, config: RobotConfig, readers: Sequence[sm2.PublicKey]) -> None:
         """Go on by other topics, nodes and [capture], and seal for these readers; to be called in the loop's thread."""
         self._add_losses(time.monotonic())
         self.box.change_rules(config.triggers())
         self.capture.change_rules(config.rules())
         self.source.watch(Selection.of(config))
-        self.writer.take_up(readers)
+        self.writer.change_readers(readers)
 
     def fire(self, why: str, name: str | None = None) -> None:
         """An event of this trigger, or of all, by hand; to be called in the loop's thread."""
@@ -430,7 +430,7 @@ def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConf
     try:
         config, said = reread(running, load_robot_config(home.config), keys)
         roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
-        robot.take_up(config, reader_keys(config, home, roots))
+        robot.reload(config, reader_keys(config, home, roots))
     except (BridgeError, OSError) as error:
         log.error("nothing is reloaded: %s", error)
         return running

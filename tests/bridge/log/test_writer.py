@@ -361,13 +361,13 @@ def test_a_new_reader_opens_the_next_chunk_and_finds_the_definitions_in_it():
         return closed
 
     assert read(chunk(2.0)) == (b'{"type":"T"}', message(0))
-    made.take_up([READER.public_key])
+    made.change_readers([READER.public_key])
     assert read(chunk(4.0)) == (message(0),), "nothing is said again where nothing changed"
-    made.take_up([READER.public_key, late.public_key])
+    made.change_readers([READER.public_key, late.public_key])
     both = chunk(6.0)
     assert read(both) == (b'{"type":"T"}', message(0))
     assert open_lines(LOG, both, content_key(both.header, late)) == read(both)
-    made.take_up([late.public_key])
+    made.change_readers([late.public_key])
     with pytest.raises(NoGrant):
         read(chunk(8.0))
 

@@ -259,7 +259,7 @@ def test_a_trigger_that_is_gone_after_a_reload_has_no_figures(robot: RobotHome):
     with closing(made.spool), closing(made.loop):
         metrics.show_robot("robot_1", made, 1.0)
         robot.config.write_text(topics.replace("NAME", "crash") + one)
-        made.take_up(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
+        made.reload(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
         metrics.show_robot("robot_1", made, 2.0)
         metrics.save(metrics.file_of(robot.path, "robot"))
         figures = metrics.running(robot.path)["robot"] or []
