@@ -139,7 +139,7 @@ def quiet(operator: load.Operator, looks: int) -> float:
 def measure(quick: bool) -> dict[str, Any]:
     """Calibrate, run more robots than it was calibrated by, and compare."""
     fitted, rows = calibrate(quick)
-    counts, messages, per_chunk = ([3, 6], 10, 5) if quick else ([500, 1000, 2000], 40, 10)
+    counts, messages, per_chunk = ([3, 6], 10, 5) if quick else ([200, 400, 800], 40, 10)
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         operator = load.Operator(Path(folder), "anvil", "sqlite", counts[-1], lambda text: None)
