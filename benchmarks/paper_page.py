@@ -91,7 +91,7 @@ def _server(figures: Figures) -> Any:
     stages = {
         "open the channel": [run["opening_ms"] / run["sent"] for run in runs],
         "verify signatures": [run["verifying_ms"] / run["sent"] for run in runs],
-        "the rest of the workers": [
+        "the rest of the shard": [
             max(0.0, run["message_cpu_ms"] - (run["opening_ms"] + run["verifying_ms"]) / run["sent"]) for run in runs
         ],
         "submitter": [run["submitter_cpu_ms"] for run in runs],
@@ -250,13 +250,13 @@ def _server_section(figures: Figures) -> str:
                      f"{run['equal']:,}", f"{run['lost']} / {run['doubled']} / {run['altered']}", decrypted,
                      f"{run['opening_ms']:.0f}", f"{run['message_cpu_ms']:.3f}", f"{run['to_chain']:.1f} s"))
     head = ["clients × messages", "received: paper", "here", "on the chain: paper", "here, proven and equal",
-            "lost / doubled / altered", "decryption, ms: paper (8 processes)", "here (2 processes)",
-            "workers, ms a message", "last confirmation"]  # fmt: skip
+            "lost / doubled / altered", "decryption, ms: paper (8 processes)", "here (one shard)",
+            "shard, ms a message", "last confirmation"]  # fmt: skip
     return f"""## Blockchain end
 
 Every client sends at once (the paper's Table 4 and Figure 13). Three nodes of geth with Clique, a block a second; each
 message is a chunk of its own. The two columns of decryption are not the same measure: the paper's is wall time of eight
-processes together, 0.311 to 0.78 ms a message by number of clients; here it is the processor time of two. Its contract
+processes together, 0.311 to 0.78 ms a message by number of clients; here it is the processor time of one shard. Its contract
 takes 268,924 gas for a message of 256 bytes (measured with its code); here see
 [what a record costs](bridge-figures.md).
 
