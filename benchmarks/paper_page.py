@@ -256,8 +256,8 @@ def _server_section(figures: Figures) -> str:
 
 Every client sends at once (the paper's Table 4 and Figure 13). Three nodes of geth with Clique, a block a second; each
 message is a chunk of its own. The two columns of decryption are not the same measure: the paper's is wall time of eight
-processes together, 0.311 to 0.78 ms a message by number of clients; here it is the processor time of one shard. Its contract
-takes 268,924 gas for a message of 256 bytes (measured with its code); here see
+processes together, 0.311 to 0.78 ms a message by number of clients; here it is the processor time of one shard. Its
+contract takes 268,924 gas for a message of 256 bytes (measured with its code); here see
 [what a record costs](bridge-figures.md).
 
 {table(head, rows)}
