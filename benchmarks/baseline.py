@@ -29,12 +29,12 @@ from eth_account.signers.local import LocalAccount
 from web3 import Web3
 
 import bridge_costs
+from load import DURABLE
 from ports import free_port
 from rosbridge_eth.capture import Capture
 from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 
-DURABLE = ("--appendonly", "yes", "--appendfsync", "always", "--maxmemory-policy", "noeviction", "--save", "")
 STREAM = "records"
 SETTLED = 10.0  # seconds that a replica has to connect
 

@@ -110,7 +110,10 @@ def successor(place: bytes) -> bytes:
 
 
 class Store(Protocol):
-    """Durable: what `append`, `set_state` and `remove` changed is committed when they return.
+    """What `append`, and `remove` with a reason, changed survives the loss of power when they return.
+
+    What `set_state` and other removals changed survives the end of the process; a power cut may take it back, and it is
+    then found out again from the chain.
 
     An object belongs to one thread; several objects and processes may use one store. Every method may raise StoreError;
     then nothing was changed, or (Redis) it is not known whether.
