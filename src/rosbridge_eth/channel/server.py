@@ -329,7 +329,7 @@ class Server:
             self._due.append((session.due, session))
 
     def _stand(self, session: _Session) -> None:
-        """The client has the keys, since a packet of its opened. Only now is an older session of this robot replaced."""
+        """The client has the keys, since a packet of its opened. Only now is its older session replaced."""
         if (older := self._by_name.get(session.peer.name)) is not None:
             self._remove(older, End.REPLACED)
         self._by_name[session.peer.name] = self._opening.pop(session.peer.name)
