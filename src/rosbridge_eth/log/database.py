@@ -109,6 +109,7 @@ class Database:
             if not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA wal_autocheckpoint = {self._wal_pages}")
+                self._reserved()
             if self._exclusive:
                 self.check()
 

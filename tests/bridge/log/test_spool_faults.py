@@ -48,6 +48,7 @@ def test_without_its_reserve_the_spool_takes_what_fits_the_file(tmp_path, monkey
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(os, "statvfs", fails)
+    (tmp_path / "spool.sqlite.reserve").unlink()
     spool.append(chunk(0))
     assert not (tmp_path / "spool.sqlite.reserve").exists() and len(spool.rows(NOWHERE, 9)) == 1
     spool.close()
