@@ -124,8 +124,7 @@ class Server(Endpoint):
     # What the program calls
 
     def set_state(self, connection: bytes, state: bytes) -> None:
-        """What the client is to know from now on: 1 to wire.MAX_STATE bytes, which is not checked. Nothing happens if the
-        session is gone."""
+        """What the client is to know from now on: 1 to wire.MAX_STATE bytes. Nothing happens if the session is gone."""
         session = self._sessions.get(connection)
         if session is not None and session.state != state:
             session.state = state
