@@ -204,7 +204,7 @@ def robot(
                         told = True
                         before = " or before" if any(newest[STREAM_SIZE:]) else ""
                         talk(f"The first record is in block {block}{before}.")
-                    metrics.show_robot(end.robot, running, time.time())
+                    metrics.show(metrics.of_robot(end.robot, running, time.time()))
                     metrics.save(metrics.file_of(home, "robot"))
                 show()
 

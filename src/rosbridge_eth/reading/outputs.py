@@ -391,6 +391,8 @@ class Bag:
 
 def check_picture(path: Path) -> str:
     """The format that the name's ending says, in capitals or not. ConfigError where it says none that can be drawn."""
+    if not find_spec("matplotlib"):
+        raise ConfigError(f"{path}: a picture needs matplotlib: pip install 'pysmcrypto[plot]'")
     from matplotlib.backend_bases import FigureCanvasBase
 
     kind = path.suffix.removeprefix(".").lower()

@@ -163,12 +163,12 @@ def run_shard(
 
     def show() -> None:
         if beats.due():
-            metrics.show_worker(name, made.worker, time.time())
+            metrics.show(metrics.of_worker(name, made.worker, time.time()))
             metrics.save(file)
 
     def show_submitter() -> None:
         robots = robots_of(shard, config, registry)
-        metrics.show_submitter(name, submitter, store, robots, home.path, time.time())
+        metrics.show(metrics.of_submitter(name, submitter, store, robots, home.path, time.time()))
 
     with closing(ledger), metrics.served(config.monitor and config.monitor.next(shard)):
         made.run(stopped, on_turn=show, on_submit=show_submitter)
