@@ -6,42 +6,42 @@ processes are threads. What comes back is compared with the bag's messages, fiel
 
 from __future__ import annotations
 
+import random
 import secrets
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
+from socket import socket
 from string import Template
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.table import Table
 
-from rosbridge_eth.channel.udp import UdpLoop, server_socket
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.operator import enrolment
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
-from rosbridge_eth.operator.registry import Registry
-from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
+from rosbridge_eth.reading import ProvenRecord, Verdict, outputs, read_robot
+from rosbridge_eth.reading.compare import Comparison, compare
+from rosbridge_eth.robot.loop import Robot, open_robot
 from rosbridge_eth.robot.sources import sample_bag
 from rosbridge_eth.robot.topics import robot_toml
+from rosbridge_eth.server.shard import Secrets, Shard, open_shard, open_store
 from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
-
-if TYPE_CHECKING:
-    from rosbridge_eth.cli.relay import Harm
-    from rosbridge_eth.reading.compare import Comparison
-    from rosbridge_eth.robot.loop import Robot
-    from rosbridge_eth.server.shard import Shard
 
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
@@ -82,6 +82,24 @@ class DemoResult:
         return said and self.captured == equal == len(self.records) > 0
 
 
+class LossySocket(socket):
+    """A server's socket on a network that loses this share of the datagrams, each way."""
+
+    def __init__(self, sock: socket, loss: float) -> None:
+        super().__init__(fileno=sock.detach())
+        self.setblocking(False)
+        self._loss = loss
+
+    def recvfrom(self, *arguments: Any) -> Any:
+        while True:
+            received = super().recvfrom(*arguments)
+            if random.random() >= self._loss:  # noqa: S311 - a bad network, not a secret
+                return received
+
+    def sendto(self, *arguments: Any) -> int:
+        return super().sendto(*arguments) if random.random() >= self._loss else 0  # noqa: S311
+
+
 @contextmanager
 def _serving(shard: Shard) -> Iterator[Callable[[], None]]:
     """The server, in threads; gives what raises its failure in this one."""
@@ -97,23 +115,16 @@ def _serving(shard: Shard) -> Iterator[Callable[[], None]]:
 
 
 def run_demo(
-    folder: Path, bag: Path, *, topics: Sequence[str] = (f"/{ROBOT}/odom",), harm: Harm | None = None,
-    on_datagram: Callable[[bytes], None] = lambda data: None, on_step: Callable[[str], None] = lambda text: None,
+    folder: Path, bag: Path, *, topics: Sequence[str] = (f"/{ROBOT}/odom",),
+    network: Callable[[socket], socket] = lambda sock: sock, on_step: Callable[[str], None] = lambda text: None,
     on_turn: Callable[[Robot], None] = lambda robot: None,
 ) -> DemoResult:  # fmt: skip
     """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
 
-    harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each
-    of them. on_step: is told what begins. on_turn: is given the robot at each turn of its loop.
+    network: makes the server's socket that of a worse network. on_step: is told what begins. on_turn: is given the
+    robot at each turn of its loop.
     """
-    from rosbridge_eth.cli.relay import Harm, Relay
-    from rosbridge_eth.ledger import Keyring, Ledger
-    from rosbridge_eth.ledger.nodes import EmbeddedChain
-    from rosbridge_eth.operator import enrolment as administration
-    from rosbridge_eth.reading.compare import compare
-    from rosbridge_eth.robot.loop import open_robot
-    from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
+    from rosbridge_eth.ledger.nodes import EmbeddedChain  # which imports web3
 
     started, times = time.monotonic(), dict[str, float]()
     home, robot_home, reader_home = (
@@ -130,7 +141,7 @@ def run_demo(
         times[name] = time.perf_counter() - began
 
     with step("keys and certificates"):
-        administration.init_home(
+        enrolment.init_home(
             home, passphrase, reader=reader_home, reader_passphrase=reader_passphrase, now=now, listen="127.0.0.1:0",
             public="127.0.0.1:7410",
         )
@@ -138,43 +149,39 @@ def run_demo(
         ask_to_join(robot_home, ROBOT, password)
     with step("chain and contract"):
         chain = EmbeddedChain(fund={keys.operator.address: FUNDS})
-        deployment = administration.deploy_contract(home, chain, keys)
+        deployment = enrolment.deploy_contract(home, chain, keys)
         ledger = Ledger.connect(chain, deployment)
-    config, registry = load_server_config(home.config), Registry(home.registry)
+    config = load_server_config(home.config)
     with step("registration"):
-        made = administration.register_robot(
+        made = enrolment.register_robot(
             home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
             inbox=lambda: open_store(config, home, 0), request=Request.decode(robot_home.request.read_bytes()),
         )
         join(robot_home, read_bundle(made.bundle.read_bytes()))
 
-    sock = server_socket(config.listen)
-    inbox, identity = open_store(config, home, 0), administration.load_server_identity(home, passphrase)
-    reception = open_reception(config, identity, home, registry, inbox)
-    submitter = open_submitter(config, ledger, open_store(config, home, 0), registry, keys)
-    shard = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
-    with closing(Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)) as relay:
-        # Short chunks, so that there are several.
-        more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
-        robot_home.config.write_text(f'server = "127.0.0.1:{relay.port}"\n{robot_toml(topics, str(bag))}{more}')
-        robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
+    sock, inbox = network(server_socket(config.listen)), open_store(config, home, 0)
+    shard = open_shard(config, home, Secrets(enrolment.load_server_identity(home, passphrase), keys), ledger, sock)
+    # Short chunks, so that there are several.
+    more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
+    robot_home.config.write_text(f'server = "127.0.0.1:{sock.getsockname()[1]}"\n{robot_toml(topics, str(bag))}{more}')
+    robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
 
-        with _serving(shard) as check:
+    with _serving(shard) as check:
 
-            def turn() -> None:
+        def turn() -> None:
+            check()
+            on_turn(robot)
+
+        with step("replay and delivery over UDP"):
+            robot.run(on_turn=turn)
+        turn()
+        with step("last batches"):
+            deadline = time.monotonic() + SETTLE
+            while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
                 check()
-                on_turn(robot)
-
-            with step("replay and delivery over UDP"):
-                robot.run(on_turn=turn)
-            turn()
-            with step("last batches"):
-                deadline = time.monotonic() + SETTLE
-                while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
-                    check()
-                    if time.monotonic() > deadline:
-                        raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
-                    time.sleep(0.02)
+                if time.monotonic() > deadline:
+                    raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
+                time.sleep(0.02)
     with step("fetch, open and verify"):
         reader, roots = load_identity(reader_home.path, reader_passphrase)
         reading = read_robot([ledger], ROBOT, trust=Trust(roots), reader=reader.encryption_key, now=time.time())
@@ -206,16 +213,12 @@ def _html(table: Table) -> str:
 # The command
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth demo --report demo-report")(demo)
-
-
 def demo(
     report: Annotated[Path, typer.Option(help="Folder for the report; made if absent.")] = Path("demo-report"),
     bag: Annotated[Path | None, typer.Option(help="A bag of your own; without it, the sample.")] = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
     loss: Annotated[float, typer.Option(
-        min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")] = 0.0,
+        min=0, max=0.9, help="Lose this share of the datagrams.")] = 0.0,
 ) -> None:
     """See it work: a bag onto a chain and back, proven and compared.
 
@@ -223,9 +226,6 @@ def demo(
 
     Exits with 9 if a single record is missing, altered or doubled.
     """
-    from rosbridge_eth.cli.relay import Harm
-    from rosbridge_eth.reading import outputs
-
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
@@ -235,7 +235,7 @@ def demo(
             progress.update(f"{robot.captured} records captured, {robot.sender.confirmed} chunks on the chain")
 
         result = run_demo(
-            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
+            Path(home), chosen, topics=topics, network=lambda sock: LossySocket(sock, loss),
             on_step=lambda text: errors.print(f"· {text}"), on_turn=show,
         )
     (report / "records.jsonl").write_text("".join(map(outputs.json_line, result.records)), encoding="utf-8")

@@ -22,7 +22,6 @@ from rosbridge_eth.channel import Drop
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import ConfigError, NetworkError
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
-from rosbridge_eth.log.store import Store
 
 if TYPE_CHECKING:
     from rosbridge_eth.operator.registry import Enrolment
@@ -201,12 +200,12 @@ def of_worker(process: str, worker: Worker, wall: float) -> Iterator[Figure]:
 
 
 def of_submitter(
-    process: str, submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+    process: str, submitter: Submitter, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
 ) -> Iterator[Figure]:
     """What waits for the chain, and whether it gets there. Raises StoreError."""
     yield "beat_seconds", {"process": f"{process} submitter"}, wall
-    for (tk, robot), state in zip(robots.items(), store.states([*robots]), strict=True):
-        name, held = {"robot": robot.name}, store.waiting(tk)
+    for (tk, robot), state in zip(robots.items(), submitter.store.states([*robots]), strict=True):
+        name, held = {"robot": robot.name}, submitter.store.waiting(tk)
         yield "waiting_chunks", name, held.chunks
         yield "waiting_bytes", name, held.bytes
         yield "waiting_seconds", name, 0 if held.oldest is None else max(0.0, wall - held.oldest)

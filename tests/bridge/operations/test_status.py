@@ -102,7 +102,7 @@ def test_a_revoked_robot_is_no_alarm_unless_some_of_its_chunks_wait(
 
         def alarms(now: float) -> tuple[list[str], float]:
             submitter.turn(now)
-            metrics.show(metrics.of_submitter("shard-0", submitter, inbox, registry.robots(), place.operator.path, now))
+            metrics.show(metrics.of_submitter("shard-0", submitter, registry.robots(), place.operator.path, now))
             return status(capsys)["alarms"], metrics.FIGURES["on_hold", (("robot", "robot_1"),)]
 
         now = time.time()
