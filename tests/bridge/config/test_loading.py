@@ -113,7 +113,7 @@ MISTAKES = {
     'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "unknown key 'sped' in source; did you mean 'speed'?",
     # Of a source the keys of its kind, not those of another.
     'topics = ["/a"]\nsource = {kind = "sim", path = "x"}': (
-        "unknown key 'path' in source; allowed: duration, kind, rate, robot, seed, speed"
+        "unknown key 'path' in source; allowed: duration, kind, rate, robot, speed"
     ),
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
     "topics = []": "it names nothing to watch",
