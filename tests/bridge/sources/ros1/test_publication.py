@@ -16,7 +16,7 @@ from bridge.sources.ros1.graph import SYSTEM_PYTHON
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources.ros1.api import Refusal
-from rosbridge_eth.robot.sources.ros1.tcpros import read_header, read_decoder, request_header
+from rosbridge_eth.robot.sources.ros1.tcpros import read_decoder, read_header, request_header
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "message_definition": "string data"}
 
