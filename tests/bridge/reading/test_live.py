@@ -23,7 +23,7 @@ from rosbridge_eth.capture import MessageLine, parse_line
 from rosbridge_eth.config.values import Address
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.reading import Choice, Place, ProvenRecord, live
-from rosbridge_eth.reading.live import MAX_CONNECTIONS, MAX_FIELDS, MAX_PAGES, MAX_POINTS, MAX_TOPICS, Page, View
+from rosbridge_eth.reading.live import MAX_CONNECTIONS, MAX_FIELDS, MAX_POINTS, MAX_TOPICS, Page, View
 
 __all__ = ["chain"]
 
@@ -171,17 +171,6 @@ def test_of_a_large_record_its_beginning_is_shown(watch: Watch):
     watch.view.write(NAME, proven(odometry(1, image="x" * 50_000)))
     [robot] = json.loads(watch.view.state()[1])["robots"]
     assert dict(robot["latest"][0]["fields"])["image"] == "x" * 77 + "..."
-
-
-def test_pages_beyond_the_bound_are_refused_and_closed_ones_make_room(watch: Watch):
-    shown = [watch.ask("/events") for _ in range(MAX_PAGES)]
-    assert watch.ask("/events").status == 503
-    for one in shown:
-        one.close()
-    deadline = time.monotonic() + 60
-    while watch.ask("/events").status == 503:  # noticed when it is written to
-        watch.view.show([])
-        assert time.monotonic() < deadline
 
 
 def test_another_site_s_page_takes_no_room(watch: Watch):
