@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -28,7 +29,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     except geth_network.Unavailable as reason:
         unavailable(str(reason))
     folder = tmp_path_factory.mktemp("evaluation")
-    command = [sys.executable, "-m", "benchmarks.paper", "--quick", "--runs", "2", "--out", str(folder)]
+    command = [sys.executable, "-m", "benchmarks.paper", "--quick", "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "| server (--quick) | anvil |" in done.stdout
@@ -37,18 +38,17 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nothing_is_lost_doubled_or_refused(written: Path) -> None:
     found = {name: part["measured"] for name, part in json.loads((written / "evaluation.json").read_text()).items()}
-    assert {len(runs) for runs in found.values()} == {2}
-    for user, server, bridge, poa, model in zip(
-        *(found[name] for name in ("user", "server", "bridge-poa", "poa", "scale")), strict=True
-    ):
-        assert user["delivered"] == user["messages"]
-        for run in (*server["runs"], server["paced"], bridge["run"]):
-            assert (run["lost"], run["doubled"], run["altered"], run["unsound"]) == (0, 0, 0, [])
-            assert run["equal"] == run["sent"] == run["sessions"] * run["messages"]
-        assert server["paced"]["sending"] > 1.0  # 20 messages at 10 a second
-        [asked] = poa["runs"]
-        assert (asked["registered"], asked["written"], asked["answered"]) == (4, 16, 16)
-        assert all(row["equal"] == row["messages"] for row in model["compared"])
+    [user], [server], [bridge], [poa], [model] = (
+        found[name] for name in ("user", "server", "bridge-poa", "poa", "scale")
+    )
+    assert user["delivered"] == user["messages"]
+    for run in (*server["runs"], server["paced"], bridge["run"]):
+        assert (run["lost"], run["doubled"], run["altered"], run["unsound"]) == (0, 0, 0, [])
+        assert run["equal"] == run["sent"] == run["sessions"] * run["messages"]
+    assert server["paced"]["sending"] > 1.0  # 20 messages at 10 a second
+    [asked] = poa["runs"]
+    assert (asked["registered"], asked["written"], asked["answered"]) == (4, 16, 16)
+    assert all(row["equal"] == row["messages"] for row in model["compared"])
 
 
 def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> None:
@@ -62,6 +62,17 @@ def test_the_page_has_every_part_and_its_pictures_are_there(written: Path) -> No
     pictures = [line.partition("](")[2].rstrip(")") for line in page.splitlines() if line.startswith("![")]
     assert len(pictures) == 4
     assert all((written / name).read_text().lstrip().startswith("<?xml") for name in pictures)
+
+
+def test_page_and_pictures_show_the_spread_of_several_runs(written: Path, tmp_path: Path) -> None:
+    figures = json.loads((written / "evaluation.json").read_text())
+    for part in figures.values():
+        slower = json.loads(json.dumps(part["measured"][0]), parse_float=lambda text: 1.5 * float(text))
+        part["measured"] = [part["measured"][0], slower]
+    page = paper_page.page(figures)
+    for section in page.split("\n## ")[1:]:
+        assert re.search(r"\d \(\d[\d.,]*–\d", section), section
+    assert len(paper_page.draw(figures, tmp_path)) == 4
 
 
 def test_a_point_is_the_median_with_the_lowest_and_the_highest_run() -> None:
