@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
@@ -204,7 +206,18 @@ def page(figures: Figures) -> str:
     ):  # fmt: skip
         if name in figures or name in ("chain", "bridge"):
             sections.append(make(figures))
-    return "\n\n".join(filter(None, sections)) + "\n"
+    blocks = "\n\n".join(filter(None, sections)).split("\n\n")
+    return "\n\n".join(map(_wrapped, blocks)) + "\n"
+
+
+def _wrapped(block: str) -> str:
+    """Paragraphs and lists in lines of 120; tables, headings and pictures as they are."""
+    if block.startswith("- "):
+        items = re.split(r"\n(?=- )", block)
+        return "\n".join(textwrap.fill(item, 120, subsequent_indent="  ", break_on_hyphens=False) for item in items)
+    if block.startswith(("|", "#", "![")):
+        return block
+    return textwrap.fill(block, 120, break_on_hyphens=False, break_long_words=False)
 
 
 def ran_on(figures: Figures) -> str:
@@ -239,11 +252,10 @@ in brackets the lowest and the highest where there were several.
 
 {ran_on(figures)}{notes}
 
-**What differs from the paper.** The processors: rows compare two systems on two machines. All of ours run on one:
-robots, server, three nodes and clients. A client is a session with its own socket in one of two processes; the paper
-had a process for each. Our message is signed by its chunk, sealed for the readers, and encrypted by the channel; the
-paper's was signed and encrypted twice. Our figures need the extra `[fast]`: without it, at 100 records to a chunk, the
-robot takes 1.7 times as long and the server 2.4 times."""
+**What differs from the paper.** The processors: rows compare two systems on two machines. Robots, server, nodes and
+clients share one here; a client is a socket in one of two processes, in the paper a process. Our message is signed by
+its chunk, sealed for the readers, and encrypted by the channel; the paper's was signed and encrypted twice. Our figures
+need the extra `[fast]`: without it, at 100 records to a chunk, the robot takes 1.7 times as long, the server 2.4."""
 
 
 def _user_section(figures: Figures) -> str:
@@ -518,7 +530,7 @@ A model ([scale.py](../benchmarks/scale.py)), calibrated by {costs}.
 
 Curves end where one shard's submitter has enough. Dashed, on grey, is what was not run: more than {tried:,} robots.
 
-{table(["the most robots", *(f"{rate} messages/s each" for rate in scale.RATES)], limits)}
+{table(["the most robots that a chain and one shard bear", *(f"{rate} messages/s each" for rate in scale.RATES)], limits)}
 
 Held to runs of this machine, seconds of processor:
 

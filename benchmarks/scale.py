@@ -109,7 +109,7 @@ def need(costs: Costs, robots: int, rate: float, block: float) -> Need:
 
 
 def most(costs: Costs, rate: float, block: float, gas_a_second: float = inf, submitter_cores: float = inf) -> int:
-    """The most robots that a chain holds, or so many submitters bear."""
+    """The most robots that a chain holds and so many submitters bear."""
     one = need(costs, 1, rate, block)
     return int(min(gas_a_second / one.gas_a_second, submitter_cores / one.submitter_cores))
 
@@ -185,7 +185,7 @@ def measure(quick: bool) -> dict[str, Any]:
         })  # fmt: skip
     needs = [asdict(need(costs, robots, rate, 1.0)) for rate in RATES for robots in ROBOTS]
     limits = {
-        name: {str(rate): most(costs, rate, block, gas_a_second=gas) for rate in RATES}
+        name: {str(rate): most(costs, rate, block, gas_a_second=gas, submitter_cores=1.0) for rate in RATES}
         for (name, gas), block in zip(CHAINS.items(), (1.0, 20.0, 12.0, 2.0), strict=True)
     } | {"one shard's submitter": {str(rate): most(costs, rate, 1.0, submitter_cores=1.0) for rate in RATES}}
     return {"costs": asdict(costs), "compared": compared, "needs": needs, "limits": limits}

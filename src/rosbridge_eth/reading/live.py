@@ -44,7 +44,8 @@ PATIENCE: Final = 10.0
 """Seconds for a whole request to come, and for an answer to be taken."""
 OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _FILES: Final = {
-    "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"), "/live.js": ("live.js", "text/javascript"),
+    "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"),
+    "/live.js": ("live.js", "text/javascript"), "/drawing.js": ("drawing.js", "text/javascript"),
 }  # fmt: skip
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"

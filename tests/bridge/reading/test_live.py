@@ -259,7 +259,7 @@ def test_records_are_drawn_as_they_are_proven(watch: Watch, browser: Browser, tm
     assert browser.run("document.querySelectorAll('img, article script').length") == 0
     browser.picture(tmp_path / "page.png")
     assert (tmp_path / "page.png").stat().st_size > 10_000
-    assert set(browser.requests) == {watch.url + path for path in ("", "live.css", "live.js", "events")}
+    assert set(browser.requests) == {watch.url + path for path in ("", "live.css", "live.js", "drawing.js", "events")}
     assert browser.said == []
 
 
@@ -312,10 +312,8 @@ def test_it_is_for_keyboards_narrow_screens_the_dark_and_who_wants_no_motion(wat
     assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(14, 17, 22)"
     watch.write(odometry(2))
     browser.until("document.body.textContent.includes('proven in chunk 1')")
-    animated = "[...document.querySelectorAll('*')].some((one) => getComputedStyle(one).animationName !== 'none')"
-    assert not browser.run(animated)
     browser.looks(1280, 900)
-    assert browser.run(style) == "0.4s" and browser.run(animated)
+    assert browser.run(style) == "0.4s, 0.4s"
     assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(246, 247, 249)"
     reached = []
     for _ in range(3):
