@@ -528,9 +528,10 @@ A model ([scale.py](../benchmarks/scale.py)), calibrated by {costs}.
 
 ![Cores, bytes and gas by number of robots](evaluation-scale.svg)
 
-Curves end where one shard's submitter has enough. Dashed, on grey, is what was not run: more than {tried:,} robots.
+Curves and the table end where one shard's submitter has enough. Dashed, on grey, is what was not
+run: more than {tried:,} robots.
 
-{table(["the most robots that a chain and one shard bear", *(f"{rate} messages/s each" for rate in scale.RATES)], limits)}
+{table(["the most robots on", *(f"{rate} messages/s each" for rate in scale.RATES)], limits)}
 
 Held to runs of this machine, seconds of processor:
 
