@@ -198,8 +198,8 @@ class Statement(NamedTuple):
         else:
             blocks = _span(one.place.block for one in self.records)
             yield (
-                f"That the chain has it, in block {blocks} as the file says: ask a node (--node). If it has not, somebody"
-                " could have made this with a stolen key of the robot that is revoked or replaced since."
+                f"That the chain has it, in block {blocks} as the file says: ask a node (--node). If it has not,"
+                " somebody could have made this with a stolen key of the robot that is revoked or replaced since."
             )
         yield (
             "That CA, contract and chain are the right ones: compare the CA's fingerprint, the contract's address and"
