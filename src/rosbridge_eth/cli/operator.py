@@ -66,9 +66,9 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def passphrase_of(home: OperatorHome, file: Path | None) -> bytes:
-    """The operator passphrase: from `file`, or the one that server.toml names, or asked for."""
-    configured = load_server_config(home.config).passphrase_file
-    return read_passphrase("operator", "Operator passphrase", file=file, configured=configured)
+    """The operator passphrase: from `file`, or asked for."""
+    load_server_config(home.config)  # a mistake in it is told before anybody types
+    return read_passphrase("operator", "Operator passphrase", file=file)
 
 
 def _ca(home: OperatorHome, passphrase: bytes, file: Path | None) -> CertificateAuthority:
@@ -128,8 +128,7 @@ def up(
         keys = init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
             listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
-            passphrase_file=passphrase_file,
-        )
+        )  # fmt: skip
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
         place = OperatorHome(home)
     else:
