@@ -26,9 +26,9 @@ from bridge_costs import POSE_AND_TWIST
 from rosbridge_eth.capture import Capture, TopicRule, parse_line, stream_line
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.log.chunk import Log, content_key, open_lines, robot_id, seal
+from rosbridge_eth.log.chunk import Log, content_key, open_lines, robot_id, seal, verify_signature
 from rosbridge_eth.reading.memo import Memo
-from rosbridge_eth.reading.verify import Facts, Verifier, is_signed
+from rosbridge_eth.reading.verify import Facts, Verifier
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
 from smcrypto import sm3
 
@@ -82,7 +82,7 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
             block_time=lambda block: T0_MS // 1000 + count, now=T0_MS / 1000, facts=facts,
         )  # fmt: skip
         events = (DataEvent(at, 0, tuple(encoded[at : at + 8]), 9, b"", ACCOUNT) for at in range(0, len(encoded), 8))
-        records = sum(len(read_chunk.records) for read_chunk in verifier.read(events))
+        records = sum(1 for _ in verifier.read(events))
         verdict = verifier.verdict()
         if not verdict.sound or records != count * per_chunk:
             raise SystemExit("\n".join(verdict.lines()))
@@ -109,7 +109,7 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
         print(f"{file.stat().st_size / count:8.0f} bytes a chunk on the disk")
     for name, step in (
         ("SM3 of 1 KiB, for comparison", lambda chunk: sm3.digest(bytes(1024))),
-        ("signature", lambda chunk: is_signed(log, robot.signing_key.public_key, chunk)),
+        ("signature", lambda chunk: verify_signature(log, robot.signing_key.public_key, chunk)),
         ("content key", lambda chunk: content_key(chunk.header, reader)),
         ("content key, and opening", lambda chunk: open_lines(log, chunk, content_key(chunk.header, reader))),
         ("parsing", lambda chunk: [parse_line(line) for line in lines[: per_chunk]]),

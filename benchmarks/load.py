@@ -38,7 +38,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -305,7 +305,9 @@ def read_back(operator: Operator, ledger: Ledger, robot: Identity) -> ReadBack:
         reader=operator.reader.encryption_key, block=ledger.block_number(), block_time=ledger.block_time,
         now=time.time(),
     )
-    lines = {one.place.digest: [record.line for record in one.records] for one in verifier.read(events)}
+    lines = defaultdict[bytes, list[bytes]](list)
+    for record in verifier.read(events):
+        lines[record.place.digest].append(record.line)
     verdict = verifier.verdict(())
     findings = [] if verdict.sound else [f"{robot.name}: {line}" for line in verdict.lines()]
     return ReadBack([event.chunks for event in events], lines, findings)

@@ -5,7 +5,7 @@
 //   npm ci && node verify.mjs --node URL --contract ADDRESS --robot NAME --ca ca.crt.pem [--key HEX]
 //
 // It does what docs/reading.md and docs/log.md say of one reading at one node. It leaves what outlives a reading or needs
-// more than one node: bookmarks (so no `rolled-back`, `elsewhere` and `new-certificate`), the comparison of nodes
+// more than one node: bookmarks (so no `rolled-back` and `new-certificate`), the comparison of nodes
 // (`contradicted`), grants that another reader made, and whether the chain was reorganised meanwhile.
 //
 // --key is the reader's private encryption key, 32 bytes in hex; without it everything but the content is checked. It is

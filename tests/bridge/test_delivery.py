@@ -23,10 +23,19 @@ from eth_hash.auto import keccak
 
 from bridge.channel.simulation import Faults, Network
 from rosbridge_eth import identity as ids
-from rosbridge_eth.channel import Client, ClientConfig, Event, Server, ServerConfig, cookie_key
+from rosbridge_eth.channel import (
+    Client,
+    ClientConfig,
+    Disconnected,
+    End,
+    Event,
+    Server,
+    ServerConfig,
+    cookie_key,
+)
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.log.chunk import Chunk, Log, content_key, drop, open_lines, robot_id, seal
-from rosbridge_eth.log.hop import FORKED
+from rosbridge_eth.log.chunk import MAX_TIME_MS, Chunk, Log, content_key, drop, open_lines, robot_id, seal
+from rosbridge_eth.log.hop import FORKED, ServerState
 from rosbridge_eth.log.sqlite import SqliteStore
 from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, Store, place_of
 from rosbridge_eth.log.writer import LogWriter
@@ -508,6 +517,56 @@ def test_what_is_no_message_ends_the_session_and_nothing_else(tmp_path: Path, ju
     sessions = world.sender.sessions
     assert world.run(60, until=lambda: world.sender.sessions > sessions)
     world.robot.capture(5)
+    assert world.run(60)
+    assert world.stored_lines() == world.lines
+
+
+def test_what_comes_behind_no_message_is_not_looked_at(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Thousands of empty messages fit the segments that one datagram completes."""
+    world = World(tmp_path, 9, Faults())
+    world.robot.capture(5)
+    assert world.run(60)
+    for _ in range(2000):
+        world.robot.client.send(b"")
+    sessions = world.sender.sessions
+    assert world.run(60, until=lambda: world.sender.sessions > sessions)
+    assert world.reception.counts["malformed"] == 1
+    assert caplog.text.count("sends what is no chunk") == 1
+
+
+# A server that lies
+
+
+def says(world: World, *state: bytes) -> None:
+    """To the robot, which does what there is to do."""
+    world.sender.take(ServerState(*state).encode(), world.network.now)
+    world.sender.send(world.network.now)
+    world.sender.handle(Disconnected(End.SILENT, b"", identity(ids.Role.SERVER).public), world.network.now)
+
+
+@pytest.mark.parametrize("head", [0, 1, 3])
+def test_no_chunk_that_the_server_never_had_leaves_the_disk_at_its_word(tmp_path: Path, head: int) -> None:
+    """It says that a chunk is there, and confirmed, whose place it can guess, and whose digest it cannot."""
+    world = World(tmp_path, 2, Faults())
+    for _ in range(4):
+        world.robot.capture(3)
+    chunks = world.robot.chunks()
+    place, newest = place_of(chunks[head].header), place_of(chunks[-1].header)
+    says(world, place, bytes(32), place)
+    says(world, place, chunks[0].header.digest if head else bytes(32), newest)
+    assert world.robot.chunks() == chunks and world.robot.spool.covered == NOWHERE
+    world.robot.restart()
+    assert world.run(60)
+    assert world.stored_lines() == world.lines
+
+
+@pytest.mark.parametrize("time", [2**64 - 1, MAX_TIME_MS, MAX_TIME_MS - 1])
+def test_a_head_at_the_end_of_all_time_leaves_room_for_new_streams(tmp_path: Path, time: int) -> None:
+    world = World(tmp_path, 2, Faults())
+    says(world, time.to_bytes(8, "big") + b"\xff" * 16)
+    for _ in range(10):
+        world.robot.capture(3)
+        world.robot.restart()
     assert world.run(60)
     assert world.stored_lines() == world.lines
 

@@ -122,6 +122,7 @@ class Server:
         self._offered: OrderedDict[tuple[Address, Hello], _Session] = OrderedDict()
         self._sessions: dict[bytes, _Session] = {}
         self._by_name: dict[str, _Session] = {}  # those that stand: a packet of the client's has opened
+        self._opening: dict[str, _Session] = {}  # the others, one a client: the newest
         self._touched: dict[bytes, _Session] = {}  # to be answered now
         self._due: deque[tuple[float, _Session]] = deque()  # to be answered later, in order
         self._sweep_at = now
@@ -164,7 +165,7 @@ class Server:
 
     def statistics(self) -> Counter[str]:
         """What was counted since this server was made, each Drop among it, and what is there at this moment."""
-        half_open = len(self._proofs) + len(self._sessions) - len(self._by_name)
+        half_open = len(self._proofs) + len(self._opening)
         return Counter({"early": 0, **self._counts, "connections": len(self._by_name), "half_open": half_open})
 
     # What the network and the clock call
@@ -263,7 +264,7 @@ class Server:
         body = proof.assembly.add(piece)
         if body is None:
             return
-        if len(self._sessions) - len(self._by_name) >= self.config.max_half_open:
+        if len(self._opening) >= self.config.max_half_open:
             raise Refused(Drop.HALF_OPEN)
         if self._share.available(now) <= 0:
             raise Refused(Drop.BUSY)  # it is examined when it comes again
@@ -288,6 +289,9 @@ class Server:
         )  # fmt: skip
         receiving = Receiving(self._counts, self.config.max_early)
         session = self._sessions[cid] = self._offered[key] = _Session(agreed, cid, key, credit, now, receiving)
+        if (older := self._opening.get(agreed.peer.name)) is not None:
+            self._remove(older, End.REPLACED)
+        self._opening[agreed.peer.name] = session
         self._outbox += [(datagram, key[0]) for datagram in session.offers()]
 
     # Sessions
@@ -325,14 +329,10 @@ class Server:
             self._due.append((session.due, session))
 
     def _stand(self, session: _Session) -> None:
-        """The client has the keys, since a packet of its opened. Only now is another session of this robot replaced;
-        not one that was begun later, since that packet may have been held back."""
-        if (other := self._by_name.get(session.peer.name)) is not None:
-            if other.began > session.began:
-                self._remove(session, End.REPLACED)
-                raise Refused(Drop.UNEXPECTED)
-            self._remove(other, End.REPLACED)
-        self._by_name[session.peer.name] = session
+        """The client has the keys, since a packet of its opened. Only now is its older session replaced."""
+        if (older := self._by_name.get(session.peer.name)) is not None:
+            self._remove(older, End.REPLACED)
+        self._by_name[session.peer.name] = self._opening.pop(session.peer.name)
         self._counts["handshakes"] += 1
         self._events.append(events.Connected(session.peer, session.cid))
 
@@ -363,6 +363,8 @@ class Server:
             if not told and (datagram := session.seal(close_frame(reason))) is not None:
                 self._outbox.append((datagram, session.address))
             self._events.append(events.Disconnected(reason, session.cid, session.peer))
+        else:
+            del self._opening[session.peer.name]
         session.receiving.release()
         session.due = NEVER
         del self._sessions[session.cid]

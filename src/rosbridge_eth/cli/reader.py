@@ -156,8 +156,7 @@ def read(
         if json:
             print_json(of_it)
     if made is not None:
-        of = made.summary
-        talk(f"{bag}: {of.whole:,} whole messages, {of.partial:,} with fields left out, {of.as_json:,} as JSON")
+        talk(f"{bag}: {made.whole:,} whole messages, {made.partial:,} with fields left out, {made.as_json:,} as JSON")
     if not follow and not chosen[name]:
         _tell_topics(topic, reading)
     for name, of_it in said.items():
@@ -183,12 +182,11 @@ def compare(
     """
     from rosbridge_eth.reading import compare as comparing
 
-    choice = comparing.time_of(bag)
     with (
         closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
         reader.reading(robot) as (reading, said),
     ):
-        made = comparing.compare(bag, topic or [], (one.content for one in reading.records(choice)), some=some)
+        made = comparing.compare(bag, topic or [], (one.content for one in reading.records()), some=some)
         said |= asdict(made)
     if json:
         print_json(said)
@@ -227,7 +225,7 @@ def evidence(
         reader.reading(robot) as (reading, said),
     ):
         records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
-        for _ in reading.chunks:
+        for _ in reading.proven:
             continue  # the verdict is on all of the log
         if not records:
             _tell_topics(topic, reading)

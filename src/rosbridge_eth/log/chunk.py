@@ -116,11 +116,10 @@ def ledger_id(chain_id: int, genesis: bytes, contract: bytes) -> bytes:
 def stream_name(wall_ms: int, newest: bytes, randomness: Randomness = secrets.token_bytes) -> bytes:
     """The name of a stream that begins now: ms since 1970 in 8 bytes, and 8 random ones.
 
-    It is above `newest`, the newest one known of the robot, also where the clock was put back: so names order as
-    the log does.
+    It is above `newest`, the newest one known of the robot, whatever the clock says: so names order as the log does.
     """
-    began = max(wall_ms, int.from_bytes(newest[:8], "big") + 1)
-    return min(max(began, 0), MAX_TIME_MS).to_bytes(8, "big") + randomness(STREAM_SIZE - 8)
+    began = max(min(wall_ms, MAX_TIME_MS), int.from_bytes(newest[:8], "big") + 1)
+    return began.to_bytes(8, "big") + randomness(STREAM_SIZE - 8)
 
 
 @dataclass(frozen=True, slots=True)

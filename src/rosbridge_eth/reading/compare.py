@@ -27,7 +27,6 @@ from rosbridge_eth.capture import MessageLine, RawMessage
 from rosbridge_eth.capture.definitions import attribute_name
 from rosbridge_eth.config.values import counted, time_text
 from rosbridge_eth.reading.verdict import shown
-from rosbridge_eth.reading.verify import Choice
 from rosbridge_eth.robot.sources import BagSource, Selection
 from smcrypto import sm3
 
@@ -145,14 +144,6 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
         else:
             made.absent.append(shown(topic))
     return made
-
-
-def time_of(bag: Path) -> Choice:
-    """The records that can be of the messages in a bag."""
-    source = BagSource(bag, Selection(["/**"]))
-    source.close()
-    first, last = source.span
-    return Choice(from_ns=first - SLACK, to_ns=last + SLACK + 1)
 
 
 def _with_message(

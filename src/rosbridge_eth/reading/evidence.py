@@ -119,7 +119,8 @@ class Evidence(_Part):
         """The same as an HTML page that checks itself. Its policy forbids every connection and any other script."""
         folder = resources.files(__package__)
         made = (folder / "evidence.html").read_text("utf-8")
-        made = made.replace("/* evidence.js */", (folder / "evidence.js").read_text("utf-8"))
+        for name in ("evidence.js", "drawing.js"):
+            made = made.replace(f"/* {name} */", (folder / name).read_text("utf-8"))
         for kind in ("script", "style"):
             found = re.findall(rf"<{kind}>(.*?)</{kind}>", made, re.DOTALL)
             hashes = (b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in found)

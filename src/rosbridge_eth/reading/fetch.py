@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ from rosbridge_eth.identity import Trust, check_name
 from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.reading.memo import Memo
 from rosbridge_eth.reading.verdict import Bookmark, Bookmarks, Kind, Links, Progress, Verdict, shown
-from rosbridge_eth.reading.verify import EVERYTHING, Choice, Place, ProvenChunk, ProvenRecord, Verifier, digest_of
+from rosbridge_eth.reading.verify import EVERYTHING, Choice, Place, ProvenRecord, Verifier, digest_of
 from smcrypto import sm2
 
 if TYPE_CHECKING:
@@ -27,14 +26,15 @@ BEHIND = 8
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A robot's log while it is read: first `records` to the end, or `chunks`; then `verdict`, then `keep`.
+    """A robot's log while it is read: first `records` to the end; then `verdict`, then `keep`.
 
+    proven: all records, of which `records` takes those that are chosen.
     top: the block up to which is read. ledger: on the node that is read. registrations: all of them, as it says.
     trust: of who reads. now: seconds since 1970, by the reader's clock. topics: that were read so far.
     """
 
     verifier: Verifier
-    chunks: Iterator[ProvenChunk]
+    proven: Iterator[ProvenRecord]
     nodes: Sequence[str]
     top: Block
     ledger: Ledger
@@ -46,18 +46,14 @@ class Reading:
 
     def records(self, choice: Choice = EVERYTHING, first: int = 0) -> Iterator[ProvenRecord]:
         """Those that are chosen, from the chunk of index `first` on."""
-        return choice.choose(self._records(first))
+        return choice.choose(record for record in self._noted() if record.place.chunk >= first)
 
-    def _records(self, first: int) -> Iterator[ProvenRecord]:
-        for chunk in self.chunks:
-            if chunk.place.chunk >= first:
-                self._add_topics(record.content.topic for record in chunk.records)
-                yield from chunk.records
-
-    def _add_topics(self, more: Iterable[str]) -> None:
-        """For a person who named a topic that is not there: MAX_TOPICS at most, whatever a log holds."""
-        if len(self.topics) < MAX_TOPICS:
-            self.topics.update(islice(more, MAX_TOPICS))
+    def _noted(self) -> Iterator[ProvenRecord]:
+        """All of them. The topics are for who named one that is not there: MAX_TOPICS at most, whatever a log holds."""
+        for record in self.proven:
+            if len(self.topics) < MAX_TOPICS:
+                self.topics.add(record.content.topic)
+            yield record
 
     def again(self, places: Iterable[Place]) -> Iterator[tuple[DataEvent, int, Chunk]]:
         """Of a log that is read to its end, these chunks once more, with index and batch: a reading keeps none.
@@ -131,13 +127,12 @@ def read_robot(
         facts = Memo(memo / f"{name}-{log.ledger.hex()[:16]}.sqlite", reader)
     verifier = Verifier(
         name, log.ledger, standing, registrations, trust=trust, reader=reader, block=block,
-        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, granted=granted,
-        elsewhere=[] if bookmarks is None else bookmarks.other_ledgers(log), facts=facts,
+        block_time=ledger.block_time, now=now, mark=mark, at=at, links=links, granted=granted, facts=facts,
     )  # fmt: skip
     for difference in differing:
         verifier.findings.add(Kind.CONTRADICTED, max(0, standing.chunks - 1), detail=difference)
-    chunks = verifier.read(ledger.data_events(tk, first_block, standing.data_block))
-    return Reading(verifier, _settled(ledger, top, chunks), told, top, ledger, registrations, trust, now, facts)
+    records = verifier.read(ledger.data_events(tk, first_block, standing.data_block))
+    return Reading(verifier, _settled(ledger, top, records), told, top, ledger, registrations, trust, now, facts)
 
 
 def _goes_on(ledger: Ledger, before: Reading, block: int, registrations: Sequence[RegistrationEvent]) -> bool:
@@ -161,9 +156,9 @@ def _is_above(ledger: Ledger, tk: bytes, mark: Bookmark, block: int) -> bool:
     return False
 
 
-def _settled(ledger: Ledger, top: Block, chunks: Iterator[ProvenChunk]) -> Iterator[ProvenChunk]:
-    """The chunks; then ChainError if the chain was reorganised meanwhile: what is not there may have moved."""
-    yield from chunks
+def _settled(ledger: Ledger, top: Block, records: Iterator[ProvenRecord]) -> Iterator[ProvenRecord]:
+    """The records; then ChainError if the chain was reorganised meanwhile: what is not there may have moved."""
+    yield from records
     if ledger.block(top.number).hash != top.hash:
         raise ChainError(
             f"the chain of {shown(ledger.url)} was reorganised while it was read; read again, with more confirmations"

@@ -10,6 +10,7 @@ Memory is bounded: so many points of a trajectory, the newest record of so many 
 from __future__ import annotations
 
 import json
+import re
 import socket
 import sys
 import threading
@@ -21,13 +22,12 @@ from importlib import resources
 from io import BufferedReader
 from itertools import islice
 from typing import Any, Final
-from urllib.parse import urlsplit
 
 from rosbridge_eth.config.values import Address, time_text
 from rosbridge_eth.errors import NetworkError
 from rosbridge_eth.reading.follow import EVERY, Followed
 from rosbridge_eth.reading.outputs import Trajectory, flattened
-from rosbridge_eth.reading.verdict import shown
+from rosbridge_eth.reading.verdict import HEARTBEAT, shown
 from rosbridge_eth.reading.verify import ProvenRecord
 
 MAX_POINTS: Final = 1 << 10
@@ -36,17 +36,16 @@ MAX_TOPICS: Final = 64
 MAX_FIELDS: Final = 64
 MAX_TOPIC: Final = 255
 """Characters of its name."""
-MAX_PAGES: Final = 16
-"""Pages that are shown at once."""
 MAX_CONNECTIONS: Final = 64
-"""At once; each has a thread. Further ones are closed, so that the reading keeps its memory and its files."""
+"""At once, with those of the pages that are shown; each has a thread. Further ones are closed."""
 QUIET: Final = 15
 """So many seconds without news, and a comment is sent: an end that is gone is noticed."""
 PATIENCE: Final = 10.0
 """Seconds for a whole request to come, and for an answer to be taken."""
 OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _FILES: Final = {
-    "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"), "/live.js": ("live.js", "text/javascript"),
+    "/": ("live.html", "text/html"), "/live.css": ("live.css", "text/css"),
+    "/live.js": ("live.js", "text/javascript"), "/drawing.js": ("drawing.js", "text/javascript"),
 }  # fmt: skip
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
@@ -105,7 +104,7 @@ def _standing(robot: Followed) -> dict[str, Any]:
     return {
         "trouble": robot.trouble, "sound": verdict.sound, "block": verdict.block, "block_s": top.time,
         "chunks": verdict.chunks, "records": verdict.records, "goodbye": head is not None and head.goodbye,
-        "sealed_ms": head and head.sealed_ms, "silent_s": verdict.heartbeat, "lines": list(verdict.lines()),
+        "sealed_ms": head and head.sealed_ms, "silent_s": HEARTBEAT, "lines": list(verdict.lines()),
     }  # fmt: skip
 
 
@@ -141,7 +140,7 @@ class Page:
     def __init__(self, address: Address, view: View) -> None:
         files = resources.files(__package__)
         handler = type("_View", (_Handler,), {
-            "view": view, "names": OWN_NAMES | {address.host.lower()}, "room": threading.BoundedSemaphore(MAX_PAGES),
+            "view": view, "names": OWN_NAMES | {address.host.lower()},
             "files": {path: (files.joinpath(name).read_bytes(), kind) for path, (name, kind) in _FILES.items()},
         })  # fmt: skip
         room = threading.BoundedSemaphore(MAX_CONNECTIONS)
@@ -177,14 +176,6 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def _host(header: str) -> str | None:
-    """The name in a Host header, without its port."""
-    try:
-        return urlsplit(f"//{header}").hostname
-    except ValueError:
-        return None
-
-
 class _Request(socket.SocketIO):
     """What comes on a connection, until PATIENCE is over: whoever sends a byte now and then holds no thread."""
 
@@ -203,7 +194,6 @@ class _Request(socket.SocketIO):
 class _Handler(BaseHTTPRequestHandler):
     view: View
     names: frozenset[str]
-    room: threading.BoundedSemaphore
     files: Mapping[str, tuple[bytes, str]]
     timeout, server_version, sys_version = PATIENCE, "rosbridge-eth", ""
 
@@ -214,7 +204,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.connection.settimeout(self.timeout)
         # A site that gave its own name this machine's address (DNS rebinding) comes with its own name here.
-        if _host(self.headers.get("Host", "")) not in self.names:
+        if re.sub(r":\d+$", "", self.headers.get("Host", "")).strip("[]").lower() not in self.names:
             self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")
         elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             # Another site's page cannot read them, but could take up all the room.
@@ -234,24 +224,16 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _send_events(self) -> None:
-        if not self.room.acquire(blocking=False):
-            self._send(HTTPStatus.SERVICE_UNAVAILABLE, b"too many pages are shown\n")
-            return
-        try:
-            self._send(HTTPStatus.OK, b"retry: 1000\n\n", "text/event-stream")
-            sent, quiet = -1, 0
-            while not self.view.closed.wait(EVERY if sent >= 0 else 0):
-                quiet += 1
-                if self.view.version != sent:
-                    (sent, state), quiet = self.view.state(), 0
-                    self.wfile.write(b"data: " + state + b"\n\n")
-                elif quiet >= QUIET:
-                    self.wfile.write(b":\n\n")
-                    quiet = 0
-        except OSError:
-            pass  # the page was closed
-        finally:
-            self.room.release()
+        self._send(HTTPStatus.OK, b"retry: 1000\n\n", "text/event-stream")
+        sent, quiet = -1, 0
+        while not self.view.closed.wait(EVERY if sent >= 0 else 0):
+            quiet += 1
+            if self.view.version != sent:
+                (sent, state), quiet = self.view.state(), 0
+                self.wfile.write(b"data: " + state + b"\n\n")
+            elif quiet >= QUIET:
+                self.wfile.write(b":\n\n")
+                quiet = 0
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: whoever looks on is no event of the reading."""

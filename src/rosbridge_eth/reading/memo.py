@@ -38,13 +38,8 @@ class Memo:
         try:
             path.parent.mkdir(mode=0o700, exist_ok=True)
             os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-            try:
-                self._db = _open(path)
-            except sqlite3.OperationalError:  # in use
-                raise
-            except sqlite3.DatabaseError:  # no database
-                path.write_bytes(b"")
-                self._db = _open(path)
+            self._db = sqlite3.connect(path)
+            self._db.execute("CREATE TABLE IF NOT EXISTS fact (name BLOB PRIMARY KEY, sealed BLOB) WITHOUT ROWID")
         except (sqlite3.Error, OSError) as error:
             self._give_up(error)
 
@@ -53,8 +48,8 @@ class Memo:
         if self._db is None:
             return None
         try:
-            [(sealed,)] = self._db.execute("SELECT sealed FROM fact WHERE name = ?", [name]).fetchall() or [(b"",)]
-            return self._gcm.decrypt(sealed[:_NONCE], sealed[_NONCE:], name) if sealed else None
+            row = self._db.execute("SELECT sealed FROM fact WHERE name = ?", [name]).fetchone()
+            return row and self._gcm.decrypt(row[0][:_NONCE], row[0][_NONCE:], name)
         except (InvalidTag, ValueError, TypeError):
             return None
         except sqlite3.Error as error:
@@ -89,13 +84,3 @@ class Memo:
         if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
             with suppress(OSError):  # damaged: the next reading begins it anew
                 self._path.write_bytes(b"")
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    db = sqlite3.connect(path)
-    try:
-        db.execute("CREATE TABLE IF NOT EXISTS fact (name BLOB PRIMARY KEY, sealed BLOB) WITHOUT ROWID")
-    except BaseException:
-        db.close()
-        raise
-    return db

@@ -7,9 +7,8 @@ A bag says no more than what was recorded:
 
     on topic          type             what
     TOPIC             the original     records of which every field was captured
-    TOPIC/partial     the original     records of which fields were left out; these are zero
+    TOPIC/partial     the original     records of which fields were not captured; these are zero
     TOPIC/json        std_msgs/String  records of which no message can be made: the record's JSON
-    /rosbridge_eth/notes  std_msgs/String  once for each topic that is not whole: which fields are zero, or why JSON
 
 The definitions of the types come from the log itself; a ROS 2 bag has one of each type, the first, and records under
 another are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other way round.
@@ -17,6 +16,7 @@ another are JSON. A ROS 1 record in a ROS 2 bag is a message, too, and the other
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -24,10 +24,10 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice
+from itertools import chain, islice
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TypeAlias
@@ -41,8 +41,6 @@ from rosbridge_eth.errors import ConfigError, SourceError, VerificationError
 from rosbridge_eth.reading.verdict import printable, shown
 from rosbridge_eth.reading.verify import MAX_TYPES, ProvenRecord
 
-NOTES: Final = "/rosbridge_eth/notes"
-MAX_NOTES: Final = 1_000
 MAX_COLUMNS: Final = 4_096
 MAX_NAME: Final = 255
 """Characters of a column's name; what has more is left out. Else a path could stand again for each field below it."""
@@ -59,7 +57,6 @@ _MCAP_END: Final = struct.pack("<BQI BQQQI", 0x0F, 4, 0, 0x02, 20, 0, 0, 0) + b"
 """Data End without a checksum, Footer without a summary, magic (mcap.dev/spec)."""
 _LAST_TIME: Final = {Wire.ROS1: 2**32 * 10**9 - 1, Wire.CDR: 2**63 - 1}
 _BAGS: Final = "NAME.bag (ROS 1), NAME.mcap or NAME.db3 (ROS 2, one file), or NAME (ROS 2, a folder)"
-_PICTURES: Final = "name it .png, .svg or .pdf"
 
 
 # JSON lines
@@ -108,8 +105,8 @@ def check_table(path: Path) -> None:
     """ConfigError unless a table can be written there."""
     if path.suffix not in (".csv", ".parquet"):
         raise ConfigError(f"{path}: a table is a .csv or a .parquet file")
-    if not find_spec("pandas") or (path.suffix == ".parquet" and not find_spec("pyarrow")):
-        raise ConfigError(f"{path}: a table takes pandas and, for Parquet, pyarrow: pip install 'pysmcrypto[table]'")
+    if path.suffix == ".parquet" and not find_spec("pyarrow"):
+        raise ConfigError(f"{path}: a Parquet file takes pyarrow: pip install 'pysmcrypto[table]', or name a .csv file")
     _new(path, "table")
 
 
@@ -119,7 +116,7 @@ _FIXED: Final = (
 )
 """Columns of every table; after them those of the messages' fields, a dot between the levels.
 
-One that has the name of a column here begins with a dot.
+A field that has the name of one of these begins with a dot.
 """
 
 
@@ -127,15 +124,13 @@ class Table:
     """Rows wait in a file until all columns, and what kinds of values they have, are known."""
 
     def __init__(self, rows: Any) -> None:
-        self._rows = rows
+        self._waiting = rows
         self._columns: dict[str, set[str]] = {name: set() for name in _FIXED}
 
     def write(self, record: ProvenRecord) -> None:
-        content, place = record.content, record.place
-        row = dict(zip(_FIXED, (
-            content.topic, content.type_name, content.source, content.received_ns, content.captured_ns, content.clock,
-            place.stream.hex(), place.number, place.chunk, record.number, place.block, "0x" + place.transaction.hex(),
-        ), strict=True))  # fmt: skip
+        content = record.content
+        known = content._asdict() | {"type": content.type_name} | proof(record)
+        row = {name: known[name] for name in _FIXED}
         for name, value in flattened(content.data, ""):
             column = printable(name)
             if len(column) <= MAX_NAME:
@@ -143,41 +138,33 @@ class Table:
         for column, value in row.items():
             if column in self._columns or len(self._columns) < MAX_COLUMNS + len(_FIXED):
                 self._columns.setdefault(column, set()).add(_kind(value))
-        self._rows.write(json.dumps(row) + "\n")
+        self._waiting.write(json.dumps(row) + "\n")
 
-    def _frames(self, values: Callable[[str, list[Any]], Any]) -> Iterator[Any]:
-        """Frames of so many rows; one without rows where there are none. values: of a column's name and its cells."""
-        self._rows.seek(0)
-        rows = [json.loads(line) for line in islice(self._rows, _BATCH)]
-        while True:
-            columns = {name: values(name, [row.get(name) for row in rows]) for name in self._columns}
-            yield import_module("pandas").DataFrame(columns)
-            if not (rows := [json.loads(line) for line in islice(self._rows, _BATCH)]):
-                return
+    def _rows(self) -> Iterator[list[Any]]:
+        """The cells of each row, one for each column."""
+        self._waiting.seek(0)
+        for line in self._waiting:
+            row = json.loads(line)
+            yield [row.get(name) for name in self._columns]
 
     def write_csv(self, path: Path) -> None:
-        series = import_module("pandas").Series
-
-        def values(name: str, cells: list[Any]) -> Any:
-            return series(list(map(_cell, cells)), dtype=object)  # else integers beside nothing become floats
-
-        for number, frame in enumerate(self._frames(values)):
-            heads = list(map(_cell, frame.columns))
-            frame.to_csv(path, mode="a", index=False, header=not number and heads)
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            for cells in chain([self._columns], self._rows()):
+                writer.writerow(map(_cell, cells))
 
     def write_parquet(self, path: Path) -> None:
-        pandas, pyarrow = import_module("pandas"), import_module("pyarrow")
-        types = {name: _arrow(pyarrow, name, kinds) for name, kinds in self._columns.items()}
-
-        def values(name: str, cells: list[Any]) -> Any:
-            type_, value = types[name]
-            made = pyarrow.array([None if cell is None else value(cell) for cell in cells], type_)
-            return pandas.arrays.ArrowExtensionArray(made)
-
-        schema = pyarrow.schema([(name, type_) for name, (type_, _) in types.items()])
+        pyarrow = import_module("pyarrow")
+        types = [_arrow(pyarrow, name, kinds) for name, kinds in self._columns.items()]
+        schema = pyarrow.schema([(name, type_) for name, (type_, _) in zip(self._columns, types, strict=True)])
+        rows = self._rows()
         with import_module("pyarrow.parquet").ParquetWriter(path, schema, compression="zstd") as writer:
-            for frame in self._frames(values):
-                writer.write_table(pyarrow.Table.from_pandas(frame, schema, preserve_index=False))
+            while batch := list(islice(rows, _BATCH)):
+                columns = [
+                    [None if cell is None else value(cell) for cell in cells]
+                    for (_, value), cells in zip(types, zip(*batch, strict=True), strict=True)
+                ]
+                writer.write_table(pyarrow.table(columns, schema))
 
 
 def flattened(data: Mapping[str, Any], path: str) -> Iterator[tuple[str, Any]]:
@@ -256,16 +243,6 @@ def check_bag(path: Path) -> Wire:
     return Wire.ROS1 if path.suffix == ".bag" else Wire.CDR
 
 
-@dataclass(slots=True)
-class BagSummary:
-    """Messages written by kind of topic, and the notes that stand in the bag."""
-
-    whole: int = 0
-    partial: int = 0
-    as_json: int = 0
-    notes: list[str] = field(default_factory=list)
-
-
 @contextmanager
 def bag(path: Path, *, grows: bool = False) -> Iterator[Bag]:
     """A bag of the kind that `check_bag` finds the name to say. Messages bear the time at which they were received.
@@ -278,41 +255,31 @@ def bag(path: Path, *, grows: bool = False) -> Iterator[Bag]:
     with _whole(path) as within:
         if wire is Wire.ROS1:
             with rosbag1.Writer(within) as writer:
-                made = Bag(writer, wire)
-                yield made
-                made.write_notes()
+                yield Bag(writer, wire)
             return
         plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
         # A ROS 2 bag is written as a folder; its one storage file has the definitions too and stands by itself.
         folder = within.with_name("bag") if path.suffix else within
         with rosbag2.Writer(folder, version=9, storage_plugin=plugin) as two:
-            made = Bag(two, wire)
             if grows:
-                os.link(made.file, path)
-            yield made
-            made.write_notes()
+                storage: Any = two.storage
+                os.link(storage.path, path)
+            yield Bag(two, wire)
         if path.suffix:
             [storage] = folder.glob(f"*{path.suffix}")
             storage.rename(within)
 
 
 class Bag:
-    """Makes messages of records again and writes them as they come."""
+    """Makes messages of records again and writes them as they come. whole, partial, as_json: how many, by topic."""
 
     def __init__(self, writer: Any, wire: Wire) -> None:
         self._writer, self._wire = writer, wire
         self._connections: dict[tuple[str, ...], Any] = {}
-        self._restorations: dict[tuple[str, TypeLine | None], Restoration | str] = {}
         self._definitions: dict[str, str] = {}  # of a ROS 2 bag, which has one of each type
-        self._notes: dict[str, None] = {}
-        self._last = 0
-        self._string = self._restoration(_STRING, None)
-        self.summary = BagSummary()
-
-    @property
-    def file(self) -> Path:
-        """Of a ROS 2 bag, the file that holds all of it."""
-        return Path(self._writer.storage.path)
+        self._restoration = lru_cache(MAX_TYPES)(self._restoration_of)
+        self._string: Any = self._restoration(_STRING, None)
+        self.whole = self.partial = self.as_json = 0
 
     def flush(self) -> None:
         """Bring an MCAP file to an end, as one without a summary; what follows is written over that end."""
@@ -326,81 +293,50 @@ class Bag:
 
     def write(self, record: ProvenRecord) -> None:
         content = record.content
-        topic = printable(content.topic) or "/"
-        time = max(0, min(content.received_ns, _LAST_TIME[self._wire]))
-        key = content.type_name, record.definition
-        if key not in self._restorations:
-            if len(self._restorations) == MAX_TYPES:
-                self._restorations.clear()
-            try:
-                self._restorations[key] = self._restoration(*key)
-            except (SourceError, VerificationError) as error:
-                self._restorations[key] = shown(str(error))
-        restoration = self._restorations[key]
+        topic, restoration = printable(content.topic) or "/", self._restoration(content.type_name, record.definition)
         try:
-            if isinstance(restoration, str):
-                raise VerificationError(restoration)
-            restored = restoration.restore(content.data)
-        except VerificationError as error:
-            self._note(f"{topic}: as JSON: {shown(str(error))}")
-            self.summary.as_json += 1
-            self._put_string(topic + "/json", record.line.decode(), time)
-            return
-        if restored.missing:
-            topic += "/partial"
-            self.summary.partial += 1
-            self._note(f"{topic}: zero because not captured: {', '.join(restored.missing)}")
+            if restoration is None:
+                raise VerificationError(f"no message of {content.type_name} can be made here")
+            message, missing = restoration.restore(content.data)
+        except VerificationError:
+            restoration = self._string
+            message, _ = restoration.restore({"data": record.line.decode()})
+            topic += "/json"
+            self.as_json += 1
         else:
-            self.summary.whole += 1
-        self._put(topic, restoration, restored.message, time)
-
-    def _restoration(self, type_name: str, line: TypeLine | None) -> Restoration:
-        """By the log's definition; without one, by the one that rosbags knows. SourceError, VerificationError."""
-        decoder = decoder_for_known(self._wire, type_name) if line is None else line.decoder()
-        if decoder is None:
-            raise VerificationError(f"{type_name} is not known here")
-        made = Restoration(decoder, self._wire)
-        known = made.connection.get("rihs01", "")
-        if self._definitions.setdefault(made.decoder.type_name, known) != known:
-            raise VerificationError(f"{type_name} has another definition in this bag")
-        return made
-
-    def _put(self, topic: str, restoration: Restoration, message: Any, time: int) -> None:
+            topic += "/partial" if missing else ""
+            self.partial += bool(missing)
+            self.whole += not missing
         type_name, of = restoration.decoder.type_name, restoration.connection
         key = topic, type_name, of.get("md5sum", "")
         if key not in self._connections:
             self._connections[key] = self._writer.add_connection(topic, type_name, **of)
+        time = max(0, min(content.received_ns, _LAST_TIME[self._wire]))
         self._writer.write(self._connections[key], time, restoration.decoder.encode(message))
-        self._last = max(self._last, time)
 
-    def _put_string(self, topic: str, text: str, time: int) -> None:
-        self._put(topic, self._string, self._string.restore({"data": text}).message, time)
-
-    def _note(self, text: str) -> None:
-        if len(self._notes) < MAX_NOTES:
-            self._notes[text] = None
-
-    def write_notes(self) -> None:
-        self.summary.notes = list(self._notes)
-        for text in self._notes:
-            self._put_string(NOTES, text, self._last)
+    def _restoration_of(self, type_name: str, line: TypeLine | None) -> Restoration | None:
+        """By the log's definition; without one, by the one that rosbags knows. None where no message can be made."""
+        try:
+            decoder = decoder_for_known(self._wire, type_name) if line is None else line.decoder()
+            made = None if decoder is None else Restoration(decoder, self._wire)
+        except (SourceError, VerificationError):
+            return None
+        if made is not None:
+            known = made.connection.get("rihs01", "")
+            if self._definitions.setdefault(made.decoder.type_name, known) != known:
+                return None
+        return made
 
 
 # Pictures
 
 
-def check_picture(path: Path) -> str:
-    """The format that the name's ending says, in capitals or not. ConfigError where it says none that can be drawn."""
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    kind = path.suffix.removeprefix(".").lower()
-    if not kind:
-        raise ConfigError(f"{path}: the ending says which kind of picture it is; {_PICTURES}")
-    if kind not in FigureCanvasBase.get_supported_filetypes():
-        raise ConfigError(f"{path}: a picture cannot be a .{kind} file; {_PICTURES}")
+def check_picture(path: Path) -> None:
+    """ConfigError unless a picture can be drawn there."""
+    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise ConfigError(f"{path}: a picture is a .png, .svg or .pdf file")
     if not path.parent.is_dir():
         raise ConfigError(f"{path.parent} is no folder; make it first")
-    return kind
 
 
 _Point: TypeAlias = tuple[float, float, float]
@@ -500,13 +436,13 @@ def _figure(path: Path, width: float, height: float) -> Iterator[Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    kind = check_picture(path)
+    check_picture(path)
     with matplotlib.rc_context({"text.parse_math": False, "text.usetex": False, "date.converter": "concise"}):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
         with _whole(path) as within:
-            figure.savefig(within, format=kind, dpi=150)
+            figure.savefig(within, format=path.suffix[1:].lower(), dpi=150)
 
 
 def _position(data: Mapping[str, Any]) -> tuple[float, float] | None:

@@ -31,6 +31,8 @@ MAX_FINDINGS: Final = 500
 MAX_PLACES: Final = 100
 """Runs of chunks that are kept of a finding."""
 MAX_SHOWN: Final = 120
+HEARTBEAT: Final = 3600.0
+"""Seconds without a message after which a robot seals an empty chunk, unless its robot.toml says otherwise."""
 
 
 class Kind(Enum):
@@ -39,7 +41,6 @@ class Kind(Enum):
     MALFORMED = "malformed", True, "chunk", "not in the form of a chunk"
     ALTERED = "altered", True, "chunk", "not what the robot sealed"
     FORGED = "forged", True, "chunk", "not signed by the robot for this place"
-    ELSEWHERE = "elsewhere", True, "chunk", "signed by the robot for another ledger"
     MISSING = "missing", True, "place", "the robot wrote more before this than the chain has"
     FORKED = "forked", True, "place", "the robot's log branches here, or goes back"
     UNTRUSTED = "untrusted", True, "chunk", "no certificate of this robot that is to be trusted governs this"
@@ -136,27 +137,22 @@ class Head(NamedTuple):
 
 
 class Links:
-    """Of the robot's chunks that were read: the first 8 bytes of each digest, its index, and whether it has no body."""
+    """Of the robot's chunks that were read: the first 8 bytes of each digest, and whether it came without its body."""
 
     def __init__(self) -> None:
-        self.digests, self.indices, self.dropped = array("Q"), array("Q"), array("B")
+        self.digests, self.dropped = array("Q"), bytearray()
 
-    def add(self, digest: bytes, index: int, dropped: bool) -> None:
+    def add(self, digest: bytes, dropped: bool) -> None:
         self.digests.append(int.from_bytes(digest[:8], "big"))
-        self.indices.append(index)
         self.dropped.append(dropped)
 
     def _find(self, digest: bytes) -> int | None:
-        if not self.digests:
-            return None
-        known = numpy.frombuffer(self.digests, numpy.uint64)
+        known = numpy.asarray(self.digests)
         found = numpy.flatnonzero(known == int.from_bytes(digest[:8], "big"))
         return int(found[0]) if len(found) else None
 
-    def index_of(self, digest: bytes) -> int | None:
-        """Where a chunk with a header of this digest was read."""
-        at = self._find(digest)
-        return None if at is None else self.indices[at]
+    def __contains__(self, digest: bytes) -> bool:
+        return self._find(digest) is not None
 
     def restore(self, digest: bytes) -> bool:
         """Whether only the dropped form of this chunk was read; from now on the whole one was."""
@@ -242,10 +238,6 @@ class Bookmarks:
         finally:
             os.close(folder)
 
-    def other_ledgers(self, log: Log) -> list[bytes]:
-        """Ids of the other ledgers on which this reader has read the same robot."""
-        return [bytes.fromhex(key[:64]) for key in self._logs() if key[65:] == log.tk.hex() and key != _key(log)]
-
 
 def _key(log: Log) -> str:
     return f"{log.ledger.hex()}/{log.tk.hex()}"
@@ -286,8 +278,8 @@ class Verdict:
     """How a reading ended. What is counted is counted since the first chunk, over all readings that the bookmark links.
 
     chunks: how many the contract counts. block: up to which the chain was looked at. records: opened and proven.
-    head: the newest chunk that is the robot's; None where there is none. silent: it is older than the
-    heartbeat, in seconds, and the robot has not said goodbye. nodes: what other nodes said otherwise.
+    head: the newest chunk that is the robot's; None where there is none. silent: it is older than a
+    HEARTBEAT, and the robot has not said goodbye. nodes: what other nodes said otherwise.
     """
 
     robot: str
@@ -299,7 +291,6 @@ class Verdict:
     counts: Mapping[str, int]
     certificates: tuple[Governing, ...]
     silent: bool
-    heartbeat: float
     findings: tuple[Finding, ...]
     nodes: tuple[str, ...] = ()
 
@@ -318,7 +309,7 @@ class Verdict:
             if head.goodbye:
                 yield "  the robot has said goodbye: up to there, nothing is missing at the end"
             elif self.silent:
-                ago = f"longer ago than {duration_text(self.heartbeat)}, a robot's heartbeat if it was set no other"
+                ago = f"longer ago than {duration_text(HEARTBEAT)}, a robot's heartbeat if it was set no other"
                 yield f"  that is {ago}: it is silent, or what it wrote since is withheld or not written yet"
             else:
                 yield "  the robot has not said goodbye: more may follow"

@@ -2,7 +2,7 @@
 
 Pure: no clock, no file, no chain. What comes in are the contract's standing of the robot, its registrations and
 its data events, oldest first, as ledger.contract has them; the node that gave them is trusted with nothing that a
-signature or the contract's count can show. Memory is bounded: 16 bytes a chunk, the certificates, the types of the
+signature or the contract's count can show. Memory is bounded: 9 bytes a chunk, the certificates, the types of the
 messages, and the findings, of which so many are kept. docs/reading.md has the order of the checks and the reasons.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
@@ -26,20 +26,28 @@ from rosbridge_eth.log.chunk import (  # isort: skip
 from rosbridge_eth.config.values import time_text
 from rosbridge_eth.errors import IdentityError, VerificationError
 from rosbridge_eth.identity import Role, Trust, split_certificates
-from rosbridge_eth.reading.verdict import Bookmark, Findings, Governing, Head, Kind, Links, Progress, Verdict, shown
+from rosbridge_eth.reading.verdict import (
+    HEARTBEAT,
+    Bookmark,
+    Findings,
+    Governing,
+    Head,
+    Kind,
+    Links,
+    Progress,
+    Verdict,
+    shown,
+)
 from smcrypto import CertificateError, InvalidKey, sm2, sm3, x509
 
 if TYPE_CHECKING:
     from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
 
-HEARTBEAT: Final = 3600.0
-"""Seconds without a message after which a robot seals an empty chunk, unless its robot.toml says otherwise."""
 CLOCK_AHEAD_MS: Final = 300_000
 """A chunk that was sealed so much later than its block, by the clocks of robot and chain, is told."""
 CLOCK_BACK_MS: Final = 1_000
 """What a clock may be set back between two chunks without being told: what NTP does by itself."""
 MAX_TYPES: Final = 256
-MAX_ELSEWHERE: Final = 16
 NO_DIGEST: Final = bytes(32)
 REMEDY: Final = (
     "another machine has this robot's identity, or its disk was put back from an old copy: `revoke` the robot,"
@@ -95,35 +103,20 @@ class Choice:
         last: dict[str, ProvenRecord] = {}
         for record in records:
             time = record.content.received_ns
-            if self.wants(record.content.topic, time, time):
+            if (
+                (self.topic is None or record.content.topic == self.topic)
+                and (self.from_ns is None or time >= self.from_ns)
+                and (self.to_ns is None or time < self.to_ns)
+                and (self.at_ns is None or time <= self.at_ns)
+            ):
                 if self.at_ns is None:
                     yield record
                 else:
                     last[record.content.topic] = record
         yield from last.values()
 
-    def wants(self, topic: str, first: int, last: int) -> bool:
-        """Whether something of this topic that was received in these nanoseconds, both included, may be wanted."""
-        return (
-            (self.topic is None or topic == self.topic)
-            and (self.from_ns is None or last >= self.from_ns)
-            and (self.to_ns is None or first < self.to_ns)
-            and (self.at_ns is None or first <= self.at_ns)
-        )
-
 
 EVERYTHING: Final = Choice()
-
-
-@dataclass(frozen=True, slots=True)
-class ProvenChunk:
-    """A chunk that is the robot's and was opened. key: opens this one alone; with `lines` it proves single records."""
-
-    place: Place
-    chunk: Chunk
-    key: bytes = field(repr=False)
-    lines: tuple[bytes, ...] = field(repr=False)
-    records: tuple[ProvenRecord, ...] = field(repr=False)
 
 
 class Refused(VerificationError):
@@ -141,21 +134,20 @@ class Verifier:
     reader: the private key of who reads; None proves what needs no key. mark: of the last reading.
     granted: by a chunk's digest, the content key that another reader handed over.
     at, links: where to go on, on the chain that was read up to there; `read` passes over what comes before.
-    now: in seconds. block_time: of a block's number, in seconds. elsewhere: ids of other ledgers that
-    may have chunks of this robot. facts: of earlier readings; new ones are added.
+    now: in seconds. block_time: of a block's number, in seconds. facts: of earlier readings; new ones are added.
     """
 
     def __init__(
         self, name: str, ledger: bytes, standing: Standing, registrations: Sequence[RegistrationEvent], *,
         trust: Trust, reader: sm2.PrivateKey | None, block: int, block_time: Callable[[int], int], now: float,
         mark: Bookmark | None = None, at: Progress | None = None, links: Links | None = None,
-        elsewhere: Sequence[bytes] = (), granted: Mapping[bytes, bytes] | None = None, facts: Facts | None = None,
+        granted: Mapping[bytes, bytes] | None = None, facts: Facts | None = None,
     ) -> None:  # fmt: skip
         self.name, self.log, self._facts = name, Log(ledger, robot_id(name)), facts
         self._granted = granted or {}
         self._standing, self._block, self._block_time = standing, block, block_time
         self._trust, self._reader, self._mark = trust, reader, mark
-        self._now, self._elsewhere = now, elsewhere[:MAX_ELSEWHERE]
+        self._now = now
         self._at, self.links = deepcopy(at or Progress()), links or Links()
         self.findings = Findings(self._at.found, self._at.findings)
         self._broken = any(self.findings.counts[kind.label] for kind in (Kind.MISSING, Kind.FORKED))
@@ -213,8 +205,8 @@ class Verifier:
 
     # --- the pass
 
-    def read(self, events: Iterable[DataEvent]) -> Iterator[ProvenChunk]:
-        """What is proven, in the order of the log. events: oldest first."""
+    def read(self, events: Iterable[DataEvent]) -> Iterator[ProvenRecord]:
+        """The records that are proven, in the order of the log. events: oldest first."""
         end, mark = self._standing.chunks, self._mark
         for event in events:
             if event.first > self._at.count:
@@ -225,7 +217,7 @@ class Verifier:
                 if index < self._at.count:
                     continue
                 self._at.count, self._last = index + 1, encoded
-                proven = None
+                proven: Iterable[ProvenRecord] = ()
                 try:
                     proven = self._chunk(index, encoded, event)
                 except Refused as refused:
@@ -234,8 +226,7 @@ class Verifier:
                     self._marked = True
                     if self._at.digest != mark.digest:
                         self.findings.add(Kind.ROLLED_BACK, index, detail="another chunk than then")
-                if proven is not None:
-                    yield proven
+                yield from proven
         if end and self._at.count == end and self._tail() != self._standing.tail.hex():
             self.findings.add(Kind.ALTERED, end - 1, detail="the contract has another hash of its last chunk")
         self._withhold(end)
@@ -250,7 +241,7 @@ class Verifier:
             self.findings.add(Kind.WITHHELD, self._at.count, until - 1, count=until - self._at.count)
             self._at.count, self._last, self._at.tail = until, None, ""
 
-    def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> ProvenChunk:
+    def _chunk(self, index: int, encoded: bytes, event: DataEvent) -> list[ProvenRecord]:
         """The order of the checks; each may end it. A chunk that is not the robot's has no say in what follows."""
         chunk, signer = self.authentic(index, encoded)
         header, head = chunk.header, self._at.head
@@ -289,8 +280,7 @@ class Verifier:
         try:
             self._verify_signature(signer.key, chunk)
         except Forged:
-            elsewhere = any(is_signed(Log(ledger, self.log.tk), signer.key, chunk) for ledger in self._elsewhere)
-            raise Refused(Kind.ELSEWHERE if elsewhere else Kind.FORGED) from None
+            raise Refused(Kind.FORGED) from None
         if chunk.header.sealed_ms > signer.ends_ms:
             end = time_text(signer.ends_ms * 10**6)
             raise Refused(Kind.UNTRUSTED, f"sealed after the certificate's end, {end}")
@@ -317,19 +307,16 @@ class Verifier:
         breaks = ahead != 0 or goes_back or not (follows or knows_none)
         self._broken = self._broken or breaks
         # In an unbroken log what names the one before it cannot be there twice; after a break it can.
-        if (self._broken or knows_none) and self.links.index_of(header.digest) is not None:
+        if (self._broken or knows_none) and header.digest in self.links:
             raise Refused(Kind.FORKED, "a chunk that was read before, once more")
-        if goes_back or (same_stream and ahead <= 0 and breaks) or (breaks and self._knows(header.previous)):
+        if goes_back or (same_stream and ahead <= 0 and breaks) or (breaks and header.previous in self.links):
             self.findings.add(Kind.FORKED, index, detail=REMEDY)
         elif breaks:
             self.findings.add(Kind.MISSING, index, count=max(1, ahead), detail="" if ahead else "one chunk or more")
         if head is not None and not same_stream and (knows_none or not head.goodbye):
             detail = "it knows of nothing before: what it held is lost" if knows_none else ""
             self.findings.add(Kind.RESTARTED, index, detail=detail)
-        self.links.add(header.digest, index, chunk.bare)
-
-    def _knows(self, digest: bytes) -> bool:
-        return digest != NO_DIGEST and self.links.index_of(digest) is not None
+        self.links.add(header.digest, chunk.bare)
 
     def _check_clock(self, index: int, header: Header, signer: Governing, block: int) -> None:
         sealed = header.sealed_ms
@@ -344,28 +331,29 @@ class Verifier:
 
     def key_of(self, header: Header) -> bytes:
         """The content key, for this reader on the chain or handed over to it; else NoGrant."""
-        try:
-            if self._reader is None:
-                raise NoGrant(f"{header} is opened with a reader's key")
-            name = sm3.digest(b"content key" + self._reader.public_key.to_bytes() + header.encoded)
-            key = None if self._facts is None else self._facts.get(name)
-            if key is None:
-                with suppress(NoGrant):
-                    key, self._grant = unwrap(header, self._reader, self._grant)
-                if self._facts is not None:
-                    self._facts[name] = key or b""
-            if not key:
-                raise NoGrant(f"{header} was not granted to this reader")
-            return key
-        except NoGrant:
-            if header.digest not in self._granted:
-                raise
-            return self._granted[header.digest]
+        key = self._own_key(header) or self._granted.get(header.digest)
+        if not key:
+            raise NoGrant(f"{header} was not granted to this reader")
+        return key
 
-    def _open(self, place: Place, chunk: Chunk) -> ProvenChunk:
+    def _own_key(self, header: Header) -> bytes:
+        """The key that the header wraps for this reader; empty where it wraps none."""
+        if self._reader is None:
+            return b""
+        name = sm3.digest(b"content key" + self._reader.public_key.to_bytes() + header.encoded)
+        key = None if self._facts is None else self._facts.get(name)
+        if key is None:
+            key = b""
+            with suppress(NoGrant):
+                key, self._grant = unwrap(header, self._reader, self._grant)
+            if self._facts is not None:
+                self._facts[name] = key
+        return key
+
+    def _open(self, place: Place, chunk: Chunk) -> list[ProvenRecord]:
         count, key = chunk.header.records, b""
         if not count:
-            return ProvenChunk(place, chunk, b"", (), ())
+            return []
         try:
             key = self.key_of(chunk.header)
             lines = open_lines(self.log, chunk, key)
@@ -375,9 +363,9 @@ class Verifier:
             if key and key == self._granted.get(place.digest):  # who gave it could open the chunk
                 raise VerificationError(f"a wrong key was granted for {chunk.header}: remove that grant") from None
             raise Refused(Kind.UNOPENABLE, shown(str(error))) from None
-        records = tuple(self._parsed(place, lines))
+        records = list(self._parsed(place, lines))
         self._at.records += len(records)
-        return ProvenChunk(place, chunk, key, lines, records)
+        return records
 
     def _parsed(self, place: Place, lines: Sequence[bytes]) -> Iterator[ProvenRecord]:
         unsynchronised = 0
@@ -413,8 +401,7 @@ class Verifier:
         silent = head is not None and not head.goodbye and self._now - head.sealed_ms / 1000 > HEARTBEAT
         return Verdict(
             self.name, self.findings.sound, self._standing.chunks, self._block, head, self._at.records,
-            dict(self.findings.counts), tuple(self._signers), silent, HEARTBEAT, tuple(self.findings.kept),
-            tuple(nodes),
+            dict(self.findings.counts), tuple(self._signers), silent, tuple(self.findings.kept), tuple(nodes),
         )  # fmt: skip
 
     @property
@@ -476,12 +463,3 @@ def digest_of(encoded: bytes) -> bytes:
         return Chunk.parse(encoded).header.digest
     except Malformed:
         return sm3.digest(encoded)
-
-
-def is_signed(log: Log, key: sm2.PublicKey, chunk: Chunk) -> bool:
-    """Whether the robot signed this header, for this form of the chunk."""
-    try:
-        verify_signature(log, key, chunk)
-    except Forged:
-        return False
-    return True

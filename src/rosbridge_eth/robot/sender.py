@@ -25,7 +25,7 @@ from rosbridge_eth.channel import (
     State,
     Unresolved,
 )  # fmt: skip
-from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk
+from rosbridge_eth.log.chunk import MAX_TIME_MS, STREAM_SIZE, Chunk
 from rosbridge_eth.log.hop import ELSEWHERE, FORKED, HopError, ServerState, encode_offer
 from rosbridge_eth.log.store import NO_DIGEST, NOWHERE
 from rosbridge_eth.log.writer import LogWriter
@@ -147,7 +147,8 @@ class Sender:
         self.state = state
         log.debug("stream %s: the server has it up to %d", state.head[:STREAM_SIZE].hex(),
                   int.from_bytes(state.head[STREAM_SIZE:], "big"))
-        self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
+        if int.from_bytes(state.head[:8], "big") <= MAX_TIME_MS:  # above any such time there is room for no name
+            self._writer.newest = max(self._writer.newest, state.head[:STREAM_SIZE])
         if self.elsewhere:
             log.info("%s", state.why)
         elif state.why:
@@ -188,9 +189,10 @@ class Sender:
 
     def _note(self, state: ServerState) -> None:
         """Take from the disk what is confirmed, and set aside what is refused."""
-        if self._written(state.confirmed):  # else another machine wrote it, and not what stands below it here
+        ours = self._ours(state)
+        if ours and state.confirmed <= state.head:
             self.confirmed += self._spool.confirmed(state.confirmed)
-        if self._written(state.head) or (self._noted is not None and state.head < self._noted.head):
+        if ours or state.head < self._spool.covered:
             self._spool.stored(state.head)
         if state.refused != NO_DIGEST and (place := self._spool.set_aside(state.refused)):
             self.refused += 1
@@ -201,10 +203,13 @@ class Sender:
             if place[:STREAM_SIZE] == self._writer.stream:
                 self._writer.new_stream()
 
-    def _written(self, place: bytes) -> bool:
-        """Whether the chunk there is this robot's own; not known of one that has left the disk."""
-        before = max(0, int.from_bytes(place, "big") - 1).to_bytes(len(place), "big")
-        return place in (NOWHERE, self._spool.newest, *(row.place for row in self._spool.rows(before, 1)))
+    def _ours(self, state: ServerState) -> bool:
+        """Whether the server's head is a chunk of this robot's; not known of one that has left the disk. Who was never
+        sent it does not know its digest: so a server that lies has no chunk removed that it does not have, either."""
+        if (state.head, state.digest) == (self._spool.newest, self._spool.last_digest):
+            return True
+        before = max(0, int.from_bytes(state.head, "big") - 1).to_bytes(len(state.head), "big")
+        return any((row.place, row.digest) == (state.head, state.digest) for row in self._spool.rows(before, 1))
 
     def _fork(self, place: bytes, now: float) -> None:
         """Send nothing more, but once the chunk at `place`, so that the server knows, too."""

@@ -76,7 +76,8 @@ class Spool:
             raise
         self.newest, self.last_digest = state.head, state.digest
         """Place and digest of the newest chunk ever appended: `previous` of the next one."""
-        self._covered = state.confirmed  # the server's head
+        self.covered = state.confirmed
+        """The server's head, as it was told last: what is up to there may leave for what is new."""
         self._bare_to, self._bare = NOWHERE, 0  # up to here no row has a body, and how many bytes those rows take
         self._dropped_bodies = 0
 
@@ -100,7 +101,7 @@ class Spool:
     def statistics(self) -> SpoolStatistics:
         """What is in the spool at this moment."""
         first = [row.place for row in self.rows(NOWHERE, 1) if row.taken_at == _CONFIRMED]
-        every, unstored = (self._store.behind(self._tk, max([place, *first])) for place in (NOWHERE, self._covered))
+        every, unstored = (self._store.behind(self._tk, max([place, *first])) for place in (NOWHERE, self.covered))
         aside = len(self._store.dead(DEAD_LETTERS)) if self._aside else 0
         return SpoolStatistics(*every[:3], unstored.chunks, aside, self._dropped_bodies)
 
@@ -109,7 +110,7 @@ class Spool:
     def stored(self, head: bytes) -> None:
         """The server has the log up to this place; it may move back."""
         self._store.set_state(self._tk, confirmed=head)
-        self._covered = head
+        self.covered = head
 
     def confirmed(self, place: bytes) -> int:
         """What is up to this place leaves the spool, but for the newest of it, which shows a fork if there is one; what
@@ -177,7 +178,7 @@ class Spool:
         """Remove until no more than `limit` bytes are left, in the order that the module's docstring gives."""
         while (held := self._bytes()) > max(0, limit):
             oldest = self.rows(NOWHERE, 1)
-            if oldest and oldest[0].place <= self._covered:
+            if oldest and oldest[0].place <= self.covered:
                 self._remove(oldest)
             elif self._aside:
                 self._dropped_bodies += len(self._store.dead(DEAD_LETTERS))

@@ -135,6 +135,7 @@ class Reception:
             self.counts["malformed"] += 1
             log.warning("%s: sends what is no chunk (%s); its session is closed", session.peer, error)
             self.server.close_connection(session.connection, End.PROTOCOL)
+            del self.sessions[session.connection]  # and what came behind it is not looked at
             return
         self._due[session.connection] = session
         self._commit_at = min(self._commit_at, now + TURN)

@@ -428,12 +428,23 @@ def test_half_open_handshakes_are_few_and_forgotten():
     assert server.statistics()["half_open"] == 4 and len(server._proofs) == 4
     assert dropped(server) == {Drop.HALF_OPEN: 5}
     assert honest.to_server(*honest.proof)[0][0] == Kind.OFFER  # whole at once: nobody keeps it out
-    for _ in range(9):
-        Steps(server=server).until_offer()
+    for number in range(9):
+        Steps(server=server, client=make_client(1000.0, who=robot(f"robot_{number}"))).until_offer()
     assert len(server._sessions) == 4
     server.handle_timer(1020.0)
     assert server.statistics()["half_open"] == 0 and not server._sessions and not server._offered
     assert events(server) == []
+
+
+def test_a_robot_that_begins_sessions_without_end_keeps_no_other_out():
+    server = make_server(1000.0, ServerConfig(max_half_open=4, **OPEN))
+    for _ in range(9):
+        last = Steps(server=server)
+        last.until_offer()
+    assert server.statistics()["half_open"] == 1
+    Steps(server=server, client=make_client(1000.0, who=robot("robot_2"))).until_connected()
+    last.to_server(*last.to_client(*last.offer))
+    assert server.statistics().items() >= {("connections", 2), ("half_open", 0)}
 
 
 def test_an_offer_longer_than_its_proof_comes_as_the_proof_is_repeated():
@@ -469,7 +480,7 @@ def test_a_first_packet_that_was_held_back_replaces_no_session_that_was_begun_la
     second = Steps(server=server, now=1001.0).until_connected()
     events(server)
     assert second.to_server(held) == [] and events(server) == []
-    assert dropped(server) == {Drop.UNEXPECTED: 1}
+    assert dropped(server) == {Drop.UNKNOWN_CONNECTION: 1}
     second.to_server(*second.sent(b"still here"))
     assert [event.payload for event in events(server)] == [b"still here"]
     assert server.statistics().items() >= {("connections", 1), ("half_open", 0)}

@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Writer
 
 from bridge.image_bags import CAMERA, CLOUD, IMAGES, JPEG, STORE, bag_of_images
 from rosbridge_eth.capture import Capture, MessageLine, RawMessage, TopicRule, Wire, decoder_for, parse_line
-from rosbridge_eth.reading.compare import MAX_DIFFERENCES, Comparison, compare, time_of
+from rosbridge_eth.reading.compare import MAX_DIFFERENCES, Comparison, compare
 from rosbridge_eth.robot.sources import BagSource, Selection
 
 T0, STEP = 1_763_690_000_000_000_000, 100_000_000
@@ -66,8 +66,6 @@ def test_what_was_replayed_or_recorded_beside_the_robot_is_equal(tmp_path, late_
     written = messages(50)
     path = bag(tmp_path / "my.bag", written)
     assert told(compare(path, ["/t"], records(written, late_ns, fields))) == (50, 0)
-    choice = time_of(path)
-    assert all(choice.wants(one.topic, one.received_ns, one.received_ns) for one in records(written, late_ns))
 
 
 @pytest.mark.parametrize("same", [False, True])

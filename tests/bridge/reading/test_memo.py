@@ -182,9 +182,9 @@ def test_a_file_that_is_none_is_begun_anew(chain, tmp_path, content, proven):
     read(chain, tmp_path)
     [path] = (tmp_path / "proven").iterdir()
     path.write_bytes(content)
-    for _ in range(2):
+    for _ in range(3):
         assert read(chain, tmp_path)[0] == list(range(40))
-    assert len(proven) == 80
+    assert len(proven) == (120 if content else 80), "what is no database is emptied, and used by the next reading"
 
 
 def test_a_damaged_page_costs_the_keeping_once(chain, tmp_path, caplog, proven):
@@ -244,5 +244,5 @@ def test_of_endlessly_many_topics_some_are_remembered(tmp_path, monkeypatch):
     chunks = [pen.write(*(message(n, f"/t{n}") for n in range(at, at + 10))) for at in range(0, 100, 10)]
     reading = begin(Chain(events(chunks, 1), 20), tmp_path)
     assert len(list(reading.records())) == 100
-    assert 5 <= len(reading.topics) < 10
+    assert len(reading.topics) == 5
     reading.close()

@@ -34,7 +34,7 @@ from bridge.reading.world import (
 from rosbridge_eth.capture.lines import parse_line
 from rosbridge_eth.errors import VerificationError
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
-from rosbridge_eth.log.chunk import Chunk, Log, check_proof, proofs, robot_id
+from rosbridge_eth.log.chunk import Chunk, Log, robot_id
 from rosbridge_eth.reading.verdict import Findings, Kind
 from rosbridge_eth.reading.verify import NO_DIGEST, Verifier
 
@@ -63,13 +63,7 @@ def test_an_honest_log_is_sound_and_its_records_come_in_order():
     assert head is not None
     assert (head.number, head.digest, head.goodbye) == (6, chunks[-1].header.digest.hex(), True)
     assert (result.verdict.chunks, result.verdict.records) == (7, 7)
-    assert [chunk.place.chunk for chunk in result.chunks] == list(range(7))
-
-
-def test_a_record_that_was_read_can_be_shown_to_a_third_party():
-    [chunk] = read([Pen().write(message(1), message(2), message(3))]).chunks
-    header = chunk.chunk.header
-    check_proof(header.root, header.records, chunk.lines[1], next(proofs(chunk.lines, chunk.key, [1])))
+    assert [record.place.chunk for record in result.records] == [0, 0, 1, 2, 3, 4, 5]
 
 
 def test_a_robot_that_wrote_nothing():
@@ -132,8 +126,6 @@ def test_a_chunk_that_was_written_for_another_contract_is_refused():
     other = b"M" * 32
     chunk = Pen(log=Log(other, LOG.tk)).write(message(1))
     assert read([chunk]).only(Kind.FORGED).places[0][0] == 0
-    assert read([chunk], elsewhere=[b"N" * 32, other]).only(Kind.ELSEWHERE).places[0][0] == 0
-    assert read([body_tampered(chunk)], elsewhere=[other]).only(Kind.ELSEWHERE).places[0][0] == 0
 
 
 def test_a_dropped_form_that_the_robot_did_not_sign():
@@ -714,7 +706,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path):
         )  # fmt: skip
         tracemalloc.reset_peak()
         begin = tracemalloc.get_traced_memory()[0]
-        assert sum(len(chunk.records) for chunk in verifier.read(log())) == count
+        assert sum(1 for _ in verifier.read(log())) == count
         return tracemalloc.get_traced_memory()[1] - begin
 
     tracemalloc.start()

@@ -16,7 +16,7 @@ from rosbridge_eth.identity import CertificateAuthority, Identity, Role, Trust, 
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
 from rosbridge_eth.log.chunk import Chunk, Log, drop, robot_id, seal
 from rosbridge_eth.reading.verdict import Bookmark, Finding, Kind, Links, Progress, Verdict
-from rosbridge_eth.reading.verify import NO_DIGEST, ProvenChunk, Verifier
+from rosbridge_eth.reading.verify import NO_DIGEST, ProvenRecord, Verifier
 
 NAME, LEDGER = "robot_1", b"L" * 32
 LOG = Log(LEDGER, robot_id(NAME))
@@ -128,7 +128,7 @@ def standing(data: Sequence[DataEvent], registrations: Sequence[RegistrationEven
 @dataclass
 class Read:
     verifier: Verifier
-    chunks: list[ProvenChunk]
+    records: list[ProvenRecord]
     verdict: Verdict
 
     @property
@@ -138,7 +138,7 @@ class Read:
 
     @property
     def numbers(self) -> list[Any]:
-        return [record.content.data["x"] for chunk in self.chunks for record in chunk.records]
+        return [record.content.data["x"] for record in self.records]
 
     @property
     def mark(self) -> Bookmark:
@@ -151,8 +151,8 @@ class Read:
         """Where the next reading goes on."""
         links = Links()
         known = self.verifier.links
-        for digest, index, dropped in zip(known.digests, known.indices, known.dropped, strict=True):
-            links.add(digest.to_bytes(8, "big"), index, bool(dropped))
+        for digest, dropped in zip(known.digests, known.dropped, strict=True):
+            links.add(digest.to_bytes(8, "big"), bool(dropped))
         progress = TypeAdapter(Progress)
         return {"at": progress.validate_json(progress.dump_json(self.verifier.progress())), "links": links}
 
