@@ -2,8 +2,7 @@
 
 A shard of the server, and a robot, has its figures in its own memory; prometheus_client serves them on the port that
 `monitor` names. Every two seconds it saves them in a file of its home, too (`.shard-0.prom`, `.robot.prom`), which it
-removes at its end: a file that was not touched for SILENCE is of a process that was killed, or hangs. The table of
-docs/operations.md has all figures.
+removes at its end: a file that was not touched for SILENCE is of a process that was killed, or hangs.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import pytest
 
 from bridge.home.world import NOW, PASSPHRASE, READER_PASSPHRASE, TK, World
 from rosbridge_eth import identity as ids
-from rosbridge_eth.config import Address, load_reader_config, load_server_config
+from rosbridge_eth.config import Address, load_reader_config
 from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
@@ -53,23 +53,18 @@ def test_the_address_robots_are_given_is_a_machines_own() -> None:
         assert admin.own_address(given) == given
 
 
-def test_without_a_default_route_another_interface_is_found_and_last_the_loopback(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_a_default_route_it_is_the_loopbacks(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoRoute(socket.socket):
         def connect(self, address: object) -> None:
             raise OSError(101, "Network is unreachable")
 
     monkeypatch.setattr(socket, "socket", NoRoute)
-    found = admin.own_address(Address("0.0.0.0", 7410))
-    assert found.host not in ("0.0.0.0", "127.0.0.1") or len(socket.if_nameindex()) == 1
-    assert admin.own_address(Address("::", 7410)) == ("::1", 7410)
-    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "none")])
     assert admin.own_address(Address("0.0.0.0", 7410)) == ("127.0.0.1", 7410)
+    assert admin.own_address(Address("::", 7410)) == ("::1", 7410)
 
 
 @pytest.mark.parametrize("change", [
-    {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"}, {"server": "My Server"},
+    {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"},
     {"chain_url": 'http://x"\nshards = 3\n#'},
 ])
 def test_what_cannot_be_a_configuration_is_refused_before_anything_is_made(
@@ -103,16 +98,14 @@ def test_a_home_is_complete_or_none(world: World, tmp_path: Path, monkeypatch: p
     assert half.require() and ReaderHome(tmp_path / "r").require()
 
 
-def test_the_seed_of_a_mnemonic_and_a_passphrase_file_are_taken(tmp_path: Path) -> None:
+def test_the_seed_of_a_mnemonic_is_taken(tmp_path: Path) -> None:
     words = Keyring.create().mnemonic
-    home, file = OperatorHome(tmp_path / "home"), tmp_path / "pass"
-    file.write_bytes(PASSPHRASE)
+    home = OperatorHome(tmp_path / "home")
     made = admin.init_home(
         home, PASSPHRASE, reader=ReaderHome(tmp_path / "r"), reader_passphrase=READER_PASSPHRASE, now=NOW,
-        keys=Keyring.from_mnemonic(words), passphrase_file=file,
+        keys=Keyring.from_mnemonic(words),
     )
     assert Keyring.load(home.accounts, PASSPHRASE).mnemonic == words == made.mnemonic
-    assert load_server_config(home.config).passphrase_file == file
 
 
 def existing_ca(folder: Path, password: bytes) -> x509.Certificate:
