@@ -74,7 +74,7 @@ def _hello(data: bytes) -> None:
 
 
 def _fields(data: bytes) -> None:
-    parts, offsets = parse_fields(data, 4)
+    parts, offsets = parse_fields(data, [None] * 4)
     _require(fields(parts) == data[: offsets[-1]] and not any(data[offsets[-1] :]), "the fields of a proof")
 
 

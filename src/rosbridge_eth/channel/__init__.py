@@ -8,12 +8,11 @@ from rosbridge_eth.channel.admission import Address
 from rosbridge_eth.channel.client import Client
 
 from rosbridge_eth.channel.events import (  # isort: skip
-    ClientConfig, Connected, Disconnected, Drop, End, Event, Full, HandshakeFailed, Message, ServerConfig,
-    State, Unresolved,
+    ClientConfig, Connected, Disconnected, End, Event, Full, HandshakeFailed, Message, ServerConfig, State, Unresolved,
 )  # fmt: skip
 from rosbridge_eth.channel.handshake import Randomness
 from rosbridge_eth.channel.server import Server, cookie_key
-from rosbridge_eth.channel.wire import MAX_STATE, Mode, Reason
+from rosbridge_eth.channel.wire import MAX_STATE, Drop, Mode, Reason
 
 __all__ = [
     "MAX_STATE", "Address", "Client", "ClientConfig", "Connected", "Disconnected", "Drop", "End", "Event", "Full",

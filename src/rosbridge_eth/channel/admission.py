@@ -18,8 +18,6 @@ class Cookies:
     """
 
     def __init__(self, key: bytes, lifetime: float) -> None:
-        if len(key) != 32:
-            raise ValueError(f"the cookie key must be 32 bytes, not {len(key)}")
         self._key = blake2s(b"cookie", key=key).digest()
         self.lifetime = lifetime
 
@@ -40,8 +38,6 @@ class Cookies:
 
 class TokenBucket:
     """`rate` tokens a second, at most `burst` saved up. May be charged below zero, and then waits longer."""
-
-    __slots__ = ("_at", "burst", "level", "rate")
 
     def __init__(self, rate: float, burst: float, now: float) -> None:
         self.rate, self.burst, self.level, self._at = rate, burst, burst, now

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 from enum import StrEnum
 
 from rosbridge_eth.channel import events, wire
 from rosbridge_eth.channel.admission import Address
-from rosbridge_eth.channel.events import ClientConfig, Drop, End, Event, Refused, close_frame, parse_close
+from rosbridge_eth.channel.endpoint import Endpoint, utc_now
+from rosbridge_eth.channel.events import ClientConfig, End, close_frame, parse_close
 from rosbridge_eth.channel.handshake import Agreed, ClientHandshake, Randomness
 from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
-from rosbridge_eth.channel.transfer import MAX_MESSAGE, NEVER, Sending
-from rosbridge_eth.channel.wire import Answer, Assembly, Hello, Kind, Malformed, Reason
+from rosbridge_eth.channel.transfer import NEVER, Sending
+from rosbridge_eth.channel.wire import Answer, Assembly, Drop, Hello, Kind, Malformed, Reason, Refused
 from rosbridge_eth.identity import Identity, Trust
 
 FIRST_RETRY = 0.1  # s until a HELLO is repeated, where no round trip was measured yet
@@ -57,10 +58,6 @@ class Phase(StrEnum):
 _TAKES = {Phase.GREETING: (Kind.COOKIE,), Phase.PROVING: (Kind.OFFER, Kind.REFUSAL)}
 
 
-def utc_now() -> datetime:
-    return datetime.now(UTC)
-
-
 class _Session:
     """The keys of an OFFER that holds, and what is sent and heard under them."""
 
@@ -87,28 +84,24 @@ class _Session:
         return max(self.heard, self.sending.oldest) + max(SILENCE, SILENCE_PTOS * self.sending.pto)
 
 
-class Client:
+class Client(Endpoint):
     """Call `connect`; then, in a loop, `receive_datagram`, `handle_timer`, `next_event`, `datagrams_to_send`.
 
-    now: monotonic seconds, the same clock in every call. wall: the clock that certificates are checked against.
+    now: monotonic seconds, the same clock in every call. wall, randomness: see Endpoint.
     server_name: the server's name in its certificate; None takes any server of the operator.
 
-    A session that is lost is made anew, after a growing wait. Not thread-safe.
+    A session that is lost is made anew, after a growing wait.
     """
 
     def __init__(
         self, config: ClientConfig, identity: Identity, trust: Trust, server_name: str | None, now: float, *,
         wall: Callable[[], datetime] = utc_now, randomness: Randomness | None = None,
     ) -> None:  # fmt: skip
-        self.config = config
-        self.phase = Phase.IDLE
+        super().__init__(wall, randomness)
+        self.config, self.phase = config, Phase.IDLE
         self._identity, self._trust, self._server_name = identity, trust, server_name
-        self._wall, self._randomness = wall, randomness or Randomness()
         self._now = now
         self._address: Address = ("", 0)
-        self._counts: Counter[str] = Counter()
-        self._events: deque[Event] = deque()
-        self._outbox: list[bytes] = []
         self._cid = b""
         self._handshake: ClientHandshake | None = None
         self._assembly, self._bad_offers = Assembly(), 0
@@ -140,22 +133,16 @@ class Client:
 
         Raises Full where the message is longer than `room` says, or there is no session.
         """
-        if len(message) > MAX_MESSAGE:
-            raise ValueError(f"a message is at most {MAX_MESSAGE} bytes, not {len(message)}")
         if self._session is None or not self.connected or len(message) > self.room():
             raise events.Full("no session, or no room until some of what was sent is acknowledged")
         self._session.sending.write(message)
         self._session.interval = PROBE_FIRST
         self._counts["messages_sent"] += 1
 
-    def next_event(self) -> Event | None:
-        """The oldest event that was not fetched, or None. Fetch them all in each turn: nothing bounds them."""
-        return self._events.popleft() if self._events else None
-
     def close(self, now: float) -> None:
         """End the session, or the attempt at one. The server is told twice, and else learns it by silence."""
         if self.connected and self._session is not None:
-            self._outbox += [self._session.close(End.CLOSED) for _ in range(CLOSES)]
+            self._outbox += [(self._session.close(End.CLOSED), self._address) for _ in range(CLOSES)]
             self._events.append(events.Disconnected(End.CLOSED, self._cid, self._session.peer))
         self.phase = Phase.IDLE
         self._session = self._handshake = None
@@ -166,34 +153,12 @@ class Client:
 
     # What the network and the clock call
 
-    def receive_datagram(self, data: bytes, address: Address, now: float) -> None:
-        """Take what came; anything that is not right is dropped and counted."""
-        self._now = now
-        self._counts["datagrams_received"] += 1
-        self._counts["bytes_received"] += len(data)
-        try:
-            if address != self._address:
-                raise Refused(Drop.ADDRESS)
-            if data and data[0] == Kind.DATA:
-                self._on_data(data, now)
-            else:
-                self._on_handshake(data, now)
-        except Malformed:
-            self._counts[Drop.MALFORMED] += 1
-        except Refused as refused:
-            self._counts[refused.drop] += 1
-
-    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
-        """What may go to the network now."""
+    def _prepare(self, now: float) -> None:
         self._now = now
         while (session := self._session) is not None and (packet := session.sending.next(now)) is not None:
-            self._outbox.append(session.seal(*packet))
+            self._outbox.append((session.seal(*packet), self._address))
             if session.sending.packets >= SESSION_PACKETS:
                 self._end(End.EXPIRED, now)
-        out, self._outbox = self._outbox, []
-        self._counts["datagrams_sent"] += len(out)
-        self._counts["bytes_sent"] += sum(map(len, out))
-        return [(datagram, self._address) for datagram in out]
 
     def next_timer(self) -> float | None:
         """When to call `handle_timer`, on the clock of `now`; None for never."""
@@ -249,14 +214,17 @@ class Client:
 
     def _send_flight(self, now: float) -> None:
         """Send the handshake message that waits for its answer; the last of them is a probe, sealed anew each time."""
-        self._outbox = list(self._flight)
+        self._outbox = [(datagram, self._address) for datagram in self._flight]
         if self._session is not None:
             self._session.sending.probe()
         self._flight_at = now
         self._retry_at = now + self._retry_after
         self._retry_after = max(self._retry_after, min(self._retry_after * RETRY_GROWTH, LAST_RETRY))
 
-    def _on_handshake(self, data: bytes, now: float) -> None:
+    def _on_handshake(self, data: bytes, address: Address, now: float) -> None:
+        self._now = now
+        if address != self._address:
+            raise Refused(Drop.ADDRESS)
         hello, rest = Hello.parse(data)
         handshake = self._handshake
         if handshake is None or hello != handshake.hello or data[0] not in _TAKES.get(self.phase, ()):
@@ -269,12 +237,11 @@ class Client:
             self.phase = Phase.PROVING
             self._begin_flight(hello.in_pieces(Kind.PROOF, rest, handshake.proof(rest)), now)
         elif data[0] == Kind.OFFER:
-            piece = wire.parse_piece(rest)
-            body = self._assembly.add(piece)
+            body = self._assembly.add(rest)
             if body is not None:
                 self._assembly = Assembly()
                 self._on_offer(handshake, body, now)
-            elif piece[1] > len(self._flight):  # an offer of more datagrams than its proof: each draws one
+            elif self._assembly.count > len(self._flight):  # an offer of more datagrams than its proof: each draws one
                 self._send_flight(now)
         else:
             if len(rest) != 1 or rest[0] not in _HINTS:
@@ -312,7 +279,10 @@ class Client:
 
     # Session
 
-    def _on_data(self, data: bytes, now: float) -> None:
+    def _on_data(self, data: bytes, address: Address, now: float) -> None:
+        self._now = now
+        if address != self._address:
+            raise Refused(Drop.ADDRESS)
         session = self._session
         if session is None or data[1:9] != self._cid:
             raise Refused(Drop.UNKNOWN_CONNECTION)
@@ -349,7 +319,7 @@ class Client:
         if session is None:
             return
         if reason in (End.PROTOCOL, End.EXPIRED):
-            self._outbox.append(session.close(reason))
+            self._outbox.append((session.close(reason), self._address))
         if not self.connected:
             self._why = events.HandshakeFailed(f"the session ended before it began: {reason}")
             self._fail(now)

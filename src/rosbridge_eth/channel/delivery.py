@@ -24,8 +24,6 @@ MAX_PTO = 4.0  # s: after an outage the path is tried at least this often
 class RoundTrip:
     """RTT estimate (RFC 9002, 5.3), in seconds. What the peer waits before it acknowledges is taken as part of it."""
 
-    __slots__ = ("latest", "smoothed", "variance")
-
     def __init__(self, sample: float | None = None) -> None:
         self.latest, self.smoothed, self.variance = 0.0, INITIAL_RTT, INITIAL_RTT / 2
         if sample is not None:
@@ -71,11 +69,6 @@ class Window:
     window * (shortest round trip + that queue) / present round trip + QUEUE_SHARE (FAST TCP, Wei et al. 2006, with
     gamma = 1). `GAIN` bounds both.
     """
-
-    __slots__ = (
-        "_base", "_base_at", "_delivered", "_next_base", "_pacing", "_recent", "_round_end", "_round_rtt", "limited",
-        "maximum", "size",
-    )  # fmt: skip
 
     def __init__(self, now: float, maximum: int = MAX_WINDOW) -> None:
         self.size = min(INITIAL_WINDOW, maximum)

@@ -45,33 +45,6 @@ def parse_close(frame: bytes) -> End | None:
     return End.CLOSED_BY_PEER if reason is End.CLOSED else reason
 
 
-class Drop(StrEnum):
-    """Why a datagram was dropped without a word; counted in an endpoint's `statistics`."""
-
-    MALFORMED = "malformed"
-    MODE = "other mode"
-    UNEXPECTED = "unexpected in this state"
-    ADDRESS = "from another address"
-    COOKIE = "cookie wrong or too old"
-    BUSY = "no time left for handshakes"
-    HALF_OPEN = "too many half-open handshakes"
-    CONNECTIONS = "too many connections"
-    CERTIFICATE = "certificate refused"
-    SIGNATURE = "handshake signature or confirmation wrong"
-    UNKNOWN_CONNECTION = "unknown connection"
-    REPLAYED = "packet number seen before"
-    TAG = "authentication failed"
-    FULL = "no room to keep it until what comes before it is there"
-
-
-class Refused(Exception):
-    """A datagram is not accepted; `hint` is what its sender may be told."""
-
-    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
-        super().__init__(why)
-        self.drop, self.hint = drop, hint
-
-
 class Connected(NamedTuple):
     """A session stands. connection: its handle at a server (8 bytes), at a client its own id.
 

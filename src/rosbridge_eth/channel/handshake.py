@@ -29,16 +29,15 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import NamedTuple
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import wire
-from rosbridge_eth.channel.events import Drop, Refused
-from rosbridge_eth.channel.protection import SessionSecrets, finished
-from rosbridge_eth.channel.wire import Hello, Malformed, Mode, Reason
+from rosbridge_eth.channel.protection import SessionSecrets
+from rosbridge_eth.channel.wire import Drop, Hello, Malformed, Mode, Reason, Refused
 from rosbridge_eth.identity import Identity, PeerIdentity, Role, Trust
 from smcrypto import SMCryptoError, sm2, sm3
 
@@ -75,17 +74,6 @@ def _transcript(hello: Hello, cookie: bytes) -> sm3.SM3:
     return sm3.SM3(b"rosbridge-eth/3 handshake\0" + version_and_mode + hello.client_cid + hello.nonce + cookie)
 
 
-def _parse(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], list[int]]:
-    """Fields of these lengths, None for any, and their offsets."""
-    try:
-        parts, offsets = wire.parse_fields(body, len(lengths))
-    except Malformed as error:
-        raise Refused(Drop.MALFORMED, str(error)) from error
-    if any(length not in (None, len(part)) for length, part in zip(lengths, parts, strict=True)):
-        raise Refused(Drop.MALFORMED, "a field has another length")
-    return parts, offsets
-
-
 class Agreed(NamedTuple):
     """What an end has of a handshake: who the peer is, the session's secrets, and at a client the server's cid, at a
     server the body of its OFFER."""
@@ -120,7 +108,7 @@ class ClientHandshake:
         lengths = (
             wire.NONCE_SIZE, wire.CID_SIZE, None, None, POINT_SIZE if self._ephemeral else None, None, MAC_SIZE,
         )  # fmt: skip
-        (_, server_cid, signing, encryption, material, signature, mac), offsets = _parse(body, lengths)
+        (_, server_cid, signing, encryption, material, signature, mac), offsets = wire.parse_fields(body, lengths)
         try:
             peer = trust.check(signing, encryption, role=Role.SERVER, name=server_name, at=at)
         except ids.UntrustedCertificate as error:
@@ -138,10 +126,10 @@ class ClientHandshake:
         except SMCryptoError as error:
             raise Refused(Drop.SIGNATURE, "the offer does not hold") from error
         if len(shared) != SHARED_SIZE:
-            raise Refused(Drop.MALFORMED, "the secret has another length")
+            raise Malformed("the secret has another length")
         transcript.update(body[offsets[5] : offsets[6]])
         keys = SessionSecrets(shared, transcript.digest(), self.hello.mode)
-        if not hmac.compare_digest(mac, finished(keys.finished, transcript.digest())):
+        if not hmac.compare_digest(mac, keys.confirmation):
             raise Refused(Drop.SIGNATURE, "the offer does not hold")
         return Agreed(peer, keys, server_cid)
 
@@ -153,7 +141,8 @@ def answer_proof(
     """A server's side, from a whole PROOF. Refused unless its certificates and signature hold; the cookie was
     checked before. The session stands when a packet of the client's opens."""
     exchange = hello.mode is Mode.EXCHANGE
-    (signing, encryption, point, signature), offsets = _parse(body, (None, None, POINT_SIZE if exchange else 0, None))
+    lengths = (None, None, POINT_SIZE if exchange else 0, None)
+    (signing, encryption, point, signature), offsets = wire.parse_fields(body, lengths)
     try:
         peer = trust.check(signing, encryption, role=Role.ROBOT, at=at)
     except ids.UntrustedCertificate as error:
@@ -179,4 +168,4 @@ def answer_proof(
     signed = wire.fields([ids.sign(identity.signing_key, "handshake", b"server" + transcript.digest())])
     transcript.update(signed)
     keys = SessionSecrets(shared, transcript.digest(), hello.mode)
-    return Agreed(peer, keys, unsigned + signed + wire.fields([finished(keys.finished, transcript.digest())]))
+    return Agreed(peer, keys, unsigned + signed + wire.fields([keys.confirmation]))

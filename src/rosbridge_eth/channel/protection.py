@@ -12,36 +12,30 @@ each direction and are never used twice; a session ends long before its keys are
 
 from __future__ import annotations
 
-import hmac
-
-from rosbridge_eth.channel.events import Drop, Refused
-from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, DATA_OVERHEAD, Kind, Malformed, Mode
+from rosbridge_eth.channel.wire import DATA_HEADER_SIZE, DATA_OVERHEAD, Drop, Kind, Malformed, Mode, Refused
 from smcrypto import InvalidTag, kdf, sm3, sm4
 
 SESSION_PACKETS = 1 << 20
 """A session ends when so many packets were sent in a direction."""
 
 
-class SessionSecrets:
-    """The three secrets of a session. No repr shows them."""
+WINDOW = 2048
+_MASK = (1 << WINDOW) - 1
 
-    __slots__ = ("client", "finished", "server")
+
+class SessionSecrets:
+    """The secrets of a session, and the server's confirmation of the handshake: HMAC-SM3 of H3, 32 bytes. No repr shows
+    them."""
 
     def __init__(self, shared: bytes, transcript: bytes, mode: Mode) -> None:
         info = b"rosbridge-eth/3 session " + mode.name.lower().encode("ascii")
         derived = kdf.hkdf(shared, 96, salt=transcript, info=info)
         self.client, self.server, self.finished = derived[:32], derived[32:64], derived[64:]
-
-
-def finished(secret: bytes, transcript: bytes) -> bytes:
-    """The server's confirmation of a handshake: HMAC-SM3 of its transcript hash, 32 bytes."""
-    return hmac.new(secret, transcript, sm3.SM3).digest()
+        self.confirmation = sm3.hmac(self.finished, transcript)
 
 
 class Direction:
     """The keys of one direction of a session."""
-
-    __slots__ = ("_aead", "_iv")
 
     def __init__(self, secret: bytes) -> None:
         derived = kdf.hkdf(secret, 28, info=b"rosbridge-eth/3 packets")
@@ -68,30 +62,23 @@ class Direction:
 
 
 class ReplayWindow:
-    """Which of the last `size` packet numbers were received; older ones count as received.
+    """Which of the last WINDOW packet numbers were received; older ones count as received.
 
     `seen` changes nothing; `mark` is for numbers that were authenticated. Bit i of `bits`: highest - i was received.
     """
 
-    __slots__ = ("_mask", "bits", "highest", "size")
-
-    def __init__(self, size: int = 2048) -> None:
-        self.size = size
-        self.highest = -1
-        self.bits = 0
-        self._mask = (1 << size) - 1
+    def __init__(self) -> None:
+        self.highest, self.bits = -1, 0
 
     def seen(self, number: int) -> bool:
         behind = self.highest - number
-        if behind < 0:
-            return False
-        return behind >= self.size or bool(self.bits >> behind & 1)
+        return behind >= WINDOW or (behind >= 0 and bool(self.bits >> behind & 1))
 
     def mark(self, number: int) -> None:
         ahead = number - self.highest
         if ahead > 0:
             # Shifted no further than the window is wide: a jump of 2**30 must not make a number of 2**30 bits.
-            self.bits = (self.bits << min(ahead, self.size) | 1) & self._mask
+            self.bits = (self.bits << min(ahead, WINDOW) | 1) & _MASK
             self.highest = number
         else:
             self.bits |= 1 << -ahead

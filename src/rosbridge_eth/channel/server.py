@@ -8,19 +8,19 @@ DATA of unknown sessions costs a look-up, and is not answered. To no address go 
 from __future__ import annotations
 
 import time
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from datetime import datetime
 from hashlib import blake2s
 
 from rosbridge_eth.channel import events, wire
 from rosbridge_eth.channel.admission import Address, Cookies, TokenBucket
-from rosbridge_eth.channel.client import utc_now
-from rosbridge_eth.channel.events import Drop, End, Event, Refused, ServerConfig, close_frame, parse_close
+from rosbridge_eth.channel.endpoint import Endpoint, utc_now
+from rosbridge_eth.channel.events import End, ServerConfig, close_frame, parse_close
 from rosbridge_eth.channel.handshake import Agreed, Randomness, answer_proof
 from rosbridge_eth.channel.protection import SESSION_PACKETS, Direction, ReplayWindow
 from rosbridge_eth.channel.transfer import ACK_DELAY, ACK_EVERY, NEVER, Receiving
-from rosbridge_eth.channel.wire import Answer, Assembly, Frame, Hello, Kind, Malformed, Reason
+from rosbridge_eth.channel.wire import Answer, Assembly, Drop, Frame, Hello, Kind, Malformed, Reason, Refused
 from rosbridge_eth.identity import Identity, Trust
 
 HANDSHAKE_LIFETIME = 20.0
@@ -92,16 +92,15 @@ class _Session:
             self.told = self.state
         else:
             datagram = self.seal(answer._replace(data=b"").to_bytes())
-        if datagram is not None:
-            self.pending, self.due = 0, NEVER
+        self.pending, self.due = 0, NEVER
         return datagram
 
 
-class Server:
+class Server(Endpoint):
     """In a loop: `receive_datagram`, `handle_timer`, `next_event`, `datagrams_to_send`. See Client for clocks.
 
     cookie_key: 32 secret bytes, the same across restarts (`cookie_key(identity)`). stopwatch: measures what a handshake
-    costs. Not thread-safe.
+    costs.
     """
 
     def __init__(
@@ -109,38 +108,27 @@ class Server:
         wall: Callable[[], datetime] = utc_now, randomness: Randomness | None = None,
         stopwatch: Callable[[], float] = time.perf_counter,
     ) -> None:  # fmt: skip
-        self.config = config
-        self._identity, self._trust = identity, trust
-        self._wall, self._randomness, self._stopwatch = wall, randomness or Randomness(), stopwatch
+        super().__init__(wall, randomness)
+        self.config, self._identity, self._trust, self._stopwatch = config, identity, trust, stopwatch
         self._cookies = Cookies(cookie_key, HANDSHAKE_LIFETIME)
         self._share = TokenBucket(config.handshake_share, SHARE_BURST, now)
-        self._counts: Counter[str] = Counter()
-        self._events: deque[Event] = deque()
-        self._outbox: list[tuple[bytes, Address]] = []
         # In the order of their beginning; one that was answered is kept, so that it is examined once.
         self._proofs: OrderedDict[tuple[Address, Hello], _Proof] = OrderedDict()
         self._offered: OrderedDict[tuple[Address, Hello], _Session] = OrderedDict()
         self._sessions: dict[bytes, _Session] = {}
         self._by_name: dict[str, _Session] = {}  # those that stand: a packet of the client's has opened
         self._opening: dict[str, _Session] = {}  # the others, one a client: the newest
-        self._touched: dict[bytes, _Session] = {}  # to be answered now
-        self._due: deque[tuple[float, _Session]] = deque()  # to be answered later, in order
+        self._unanswered: dict[bytes, _Session] = {}  # to be answered when they are `due`
         self._sweep_at = now
 
     # What the program calls
 
-    def next_event(self) -> Event | None:
-        """The oldest event that was not fetched, or None. Fetch them all in each turn: nothing bounds them."""
-        return self._events.popleft() if self._events else None
-
     def set_state(self, connection: bytes, state: bytes) -> None:
-        """What the client is to know from now on: 1 to MAX_STATE bytes. Nothing happens if the session is gone."""
-        if not 1 <= len(state) <= wire.MAX_STATE:
-            raise ValueError(f"a state has 1 to {wire.MAX_STATE} bytes, not {len(state)}")
+        """What the client is to know from now on: 1 to wire.MAX_STATE bytes. Nothing happens if the session is gone."""
         session = self._sessions.get(connection)
         if session is not None and session.state != state:
             session.state = state
-            self._touched[connection] = session
+            self._answer_at(session, -NEVER)
 
     def close_connection(self, connection: bytes, reason: End = End.CLOSED) -> None:
         """End one session and tell the client; nothing happens if it is gone."""
@@ -170,51 +158,30 @@ class Server:
 
     # What the network and the clock call
 
-    def receive_datagram(self, data: bytes, address: Address, now: float) -> None:
-        """Take what came; anything that is not right is dropped and counted."""
-        self._counts["datagrams_received"] += 1
-        self._counts["bytes_received"] += len(data)
-        try:
-            if data and data[0] == Kind.DATA:
-                self._on_data(data, address, now)
-            else:
-                self._on_handshake(data, address, now)
-        except Malformed:
-            self._counts[Drop.MALFORMED] += 1
-        except Refused as refused:
-            self._counts[refused.drop] += 1
-
-    def datagrams_to_send(self, now: float) -> list[tuple[bytes, Address]]:
-        """What may go to the network now."""
-        touched, self._touched = self._touched, {}
-        if touched:
-            time_ms = int(self._wall().timestamp() * 1000)
-            for session in touched.values():
-                if (datagram := session.answer(time_ms)) is not None:
-                    self._outbox.append((datagram, session.address))
-                if session.number >= SESSION_PACKETS:
-                    self._remove(session, End.EXPIRED)
-        out, self._outbox = self._outbox, []
-        self._counts["datagrams_sent"] += len(out)
-        self._counts["bytes_sent"] += sum(len(datagram) for datagram, _ in out)
-        return out
+    def _prepare(self, now: float) -> None:
+        due = [session for session in self._unanswered.values() if session.due <= now]
+        time_ms = int(self._wall().timestamp() * 1000) if due else 0
+        for session in due:
+            del self._unanswered[session.cid]
+            if (datagram := session.answer(time_ms)) is not None:
+                self._outbox.append((datagram, session.address))
+            if session.number >= SESSION_PACKETS:
+                self._remove(session, End.EXPIRED)
 
     def next_timer(self) -> float | None:
         """When to call `handle_timer`, on the clock of `now`; None for never."""
-        while self._due and self._due[0][0] != self._due[0][1].due:  # it was answered before
-            self._due.popleft()
-        if self._due:
-            return min(self._due[0][0], self._sweep_at)
-        return self._sweep_at if self._proofs or self._offered or self._sessions else None
+        if not (self._proofs or self._offered or self._sessions):
+            return None
+        return min([self._sweep_at, *(session.due for session in self._unanswered.values())])
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`; harmless if nothing is."""
         if now >= self._sweep_at:
             self._sweep(now)
-        while self._due and self._due[0][0] <= now:
-            due, session = self._due.popleft()
-            if session.due == due:
-                self._touched[session.cid] = session
+
+    def _answer_at(self, session: _Session, when: float) -> None:
+        session.due = min(when, session.due)
+        self._unanswered[session.cid] = session
 
     def _sweep(self, now: float) -> None:
         self._sweep_at = now + SWEEP
@@ -239,29 +206,29 @@ class Server:
             self._counts["cookies"] += 1
             self._outbox.append((hello.datagram(Kind.COOKIE, self._cookies.make(address, hello, now)), address))
         elif data[0] == Kind.PROOF:
-            cookie, piece = rest[: wire.COOKIE_SIZE], wire.parse_piece(rest[wire.COOKIE_SIZE :])
+            cookie, piece = rest[: wire.COOKIE_SIZE], rest[wire.COOKIE_SIZE :]
             if not self._cookies.holds(cookie, address, hello, now):
                 raise Refused(Drop.COOKIE)
             self._on_proof((address, hello), cookie, piece, len(data), now)
         else:
             raise Malformed("not for a server")
 
-    def _on_proof(self, key: tuple[Address, Hello], cookie: bytes, piece: wire.Piece, size: int, now: float) -> None:
+    def _on_proof(self, key: tuple[Address, Hello], cookie: bytes, piece: bytes, size: int, now: float) -> None:
         """A PROOF from an address that has shown that it receives there."""
         if (session := self._offered.get(key)) is not None:
             if session.address == key[0]:
                 session.credit += size
                 self._outbox += [(datagram, key[0]) for datagram in session.offers()]
             return
+        proof = self._proofs.get(key) or _Proof(now)
+        body = proof.assembly.add(piece)
         if key not in self._proofs:
-            self._proofs[key] = _Proof(now)
+            self._proofs[key] = proof
             self._counts["handshakes_begun"] += 1
             if len(self._proofs) > self.config.max_half_open:
                 self._proofs.popitem(last=False)
                 self._counts[Drop.HALF_OPEN] += 1
-        proof = self._proofs[key]
         proof.size += size
-        body = proof.assembly.add(piece)
         if body is None:
             return
         if len(self._opening) >= self.config.max_half_open:
@@ -322,11 +289,9 @@ class Server:
         session.pending += 1
         if number >= SESSION_PACKETS:
             self._remove(session, End.EXPIRED)
-        elif at_once or gap or session.pending >= ACK_EVERY or session.told != session.state:
-            self._touched[session.cid] = session
-        elif session.due == NEVER:
-            session.due = now + ACK_DELAY
-            self._due.append((session.due, session))
+        else:
+            at_once = at_once or gap or session.pending >= ACK_EVERY or session.told != session.state
+            self._answer_at(session, now if at_once else now + ACK_DELAY)
 
     def _stand(self, session: _Session) -> None:
         """The client has the keys, since a packet of its opened. Only now is its older session replaced."""
@@ -346,14 +311,10 @@ class Server:
             return None
         if kind != Frame.SEGMENT or len(rest) <= 4:
             raise Malformed(f"frame {kind} does not exist, or not with {len(rest)} bytes behind it")
-        receiving, index = session.receiving, int.from_bytes(rest[:4], "big")
-        if receiving.known(index):
-            self._counts["duplicates"] += 1
-        elif not receiving.take(index, rest[4:]):
-            raise Refused(Drop.FULL)  # not marked, so not acknowledged: it comes again when there may be room
-        self._counts["messages_received"] += len(receiving.messages)
-        self._events.extend(events.Message(session.cid, payload) for payload in receiving.messages)
-        receiving.messages.clear()
+        # What is refused here is not marked, so not acknowledged: it comes again when there may be room.
+        messages = session.receiving.take(int.from_bytes(rest[:4], "big"), rest[4:])
+        self._counts["messages_received"] += len(messages)
+        self._events.extend(events.Message(session.cid, payload) for payload in messages)
         return False
 
     def _remove(self, session: _Session, reason: End, *, told: bool = False) -> None:
@@ -366,6 +327,5 @@ class Server:
         else:
             del self._opening[session.peer.name]
         session.receiving.release()
-        session.due = NEVER
         del self._sessions[session.cid]
-        self._touched.pop(session.cid, None)
+        self._unanswered.pop(session.cid, None)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from rosbridge_eth.channel import wire
 from rosbridge_eth.channel.delivery import RoundTrip, Window
-from rosbridge_eth.channel.wire import Answer, Frame, Malformed
+from rosbridge_eth.channel.wire import Answer, Drop, Frame, Malformed, Refused
 
 MAX_MESSAGE = 72 * 1024
 BUFFER = 1 << 20
@@ -203,43 +203,35 @@ class Sending:
 
 
 class Receiving:
-    """The receiving half. Whole messages are appended to `messages`, whose owner takes them out.
-
-    counts["early"]: segments that all sessions of a process keep before their turn, of which there may be `limit`.
-    """
+    """The receiving half. counts["early"]: segments that all sessions of a process keep before their turn, of which
+    there may be `limit`."""
 
     def __init__(self, counts: Counter[str], limit: int) -> None:
         self.next = 0
         """The first segment that is missing."""
-        self.messages: list[bytes] = []
         self._counts, self._limit = counts, limit
         self._early: dict[int, bytes] = {}
         self._arrived = bytearray()  # the stream, from the beginning of the message that is not whole yet
 
-    def known(self, index: int) -> bool:
-        return index < self.next or index in self._early
-
-    def take(self, index: int, data: bytes) -> bool:
-        """Keep or deliver a segment that is not known; False where there is no room for one that comes too early."""
+    def take(self, index: int, data: bytes) -> list[bytes]:
+        """The messages that a segment makes whole. Refused where there is no room for one that comes too early."""
         if index >= self.next + SEGMENTS:
             raise Malformed("a segment beyond the limit")
-        if index > self.next:
-            if len(self._early) >= RESERVED_SEGMENTS and self._counts["early"] >= self._limit:
-                return False
-            self._early[index] = data
-            self._counts["early"] += 1
-            return True
-        self._arrived += data
-        self.next += 1
+        if index < self.next or index in self._early:
+            self._counts["duplicates"] += 1
+            return []
+        if index > self.next and len(self._early) >= RESERVED_SEGMENTS and self._counts["early"] >= self._limit:
+            raise Refused(Drop.FULL)
+        self._early[index] = data
+        self._counts["early"] += 1
         while (more := self._early.pop(self.next, None)) is not None:
             self._arrived += more
             self.next += 1
             self._counts["early"] -= 1
-        self._cut()
-        return True
+        return self._cut()
 
-    def _cut(self) -> None:
-        start, end = 0, len(self._arrived)
+    def _cut(self) -> list[bytes]:
+        messages, start, end = list[bytes](), 0, len(self._arrived)
         while end - start >= LENGTH_SIZE:
             begin = start + LENGTH_SIZE
             length = int.from_bytes(self._arrived[start:begin], "big")
@@ -248,8 +240,9 @@ class Receiving:
             if begin + length > end:
                 break
             start = begin + length
-            self.messages.append(bytes(self._arrived[begin:start]))
+            messages.append(bytes(self._arrived[begin:start]))
         del self._arrived[:start]
+        return messages
 
     def release(self) -> None:
         """Give back what this session had of the process's room."""

@@ -63,11 +63,11 @@ def server_socket(address: Address) -> socket.socket:
         sock.bind(place)
     except OSError as error:
         sock.close()
-        mend = {
+        fix = {
             errno.EADDRNOTAVAIL: "no interface here has that address; listen at one of them, or at 0.0.0.0 for all",
             errno.EACCES: "choose a port from 1024 on, or run with the right to open it",
         }.get(error.errno or 0, "stop the program that has it, or choose another port")
-        raise NetworkError(f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; {mend}") from error
+        raise NetworkError(f"UDP port {place[1]} of {place[0]} cannot be opened: {error.strerror}; {fix}") from error
     return sock
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from enum import IntEnum
+from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
 VERSION = 3
@@ -25,10 +25,6 @@ DATA_HEADER_SIZE = 13
 DATA_OVERHEAD = DATA_HEADER_SIZE + 16
 MAX_PIECES = 8
 """Pieces of one handshake message: 8 of them hold about 9 KiB, two generous certificates."""
-
-
-class Malformed(ValueError):
-    """Bytes are not what the wire format says; always the sender's fault."""
 
 
 class Mode(IntEnum):
@@ -56,6 +52,40 @@ class Reason(IntEnum):
     EXPIRED = 2
     NOT_ALLOWED = 3
     FULL = 4
+
+
+class Drop(StrEnum):
+    """Why a datagram was dropped without a word; counted in an endpoint's `statistics`."""
+
+    MALFORMED = "malformed"
+    MODE = "other mode"
+    UNEXPECTED = "unexpected in this state"
+    ADDRESS = "from another address"
+    COOKIE = "cookie wrong or too old"
+    BUSY = "no time left for handshakes"
+    HALF_OPEN = "too many half-open handshakes"
+    CONNECTIONS = "too many connections"
+    CERTIFICATE = "certificate refused"
+    SIGNATURE = "handshake signature or confirmation wrong"
+    UNKNOWN_CONNECTION = "unknown connection"
+    REPLAYED = "packet number seen before"
+    TAG = "authentication failed"
+    FULL = "no room to keep it until what comes before it is there"
+
+
+class Refused(Exception):
+    """A datagram is not accepted; `hint` is what its sender may be told."""
+
+    def __init__(self, drop: Drop, why: str = "", hint: Reason | None = None) -> None:
+        super().__init__(why)
+        self.drop, self.hint = drop, hint
+
+
+class Malformed(Refused):
+    """Bytes are not what the wire format says; always the sender's fault."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(Drop.MALFORMED, why)
 
 
 # The handshake
@@ -101,39 +131,29 @@ class Hello(NamedTuple):
         return [self.datagram(kind, before + bytes((i, len(pieces))) + piece) for i, piece in enumerate(pieces)]
 
 
-Piece = tuple[int, int, bytes]
-"""What a datagram of a PROOF or an OFFER carries: index, count, a piece of the body."""
-
-
-def parse_piece(data: bytes) -> Piece:
-    if len(data) < 3 or not data[0] < data[1] <= MAX_PIECES:
-        raise Malformed("a piece that does not exist, or is empty")
-    return data[0], data[1], data[2:]
-
-
 class Assembly:
     """The pieces of one handshake message on their way; takes each index once, at most MAX_PIECES of them."""
 
-    __slots__ = ("_count", "_pieces")
-
     def __init__(self) -> None:
         self._pieces: dict[int, bytes] = {}
-        self._count = 0
+        self.count = 0
+        """How many pieces there are."""
 
-    def add(self, piece: Piece) -> bytes | None:
-        """The whole body once all its pieces have come, else None.
+    def add(self, piece: bytes) -> bytes | None:
+        """Take index, count and a piece of the body. The whole body once all its pieces have come, else None.
 
         If the number of pieces changed: Malformed, and begun anew; one wrong piece must not keep the right ones out.
         """
-        index, count, data = piece
-        if self._pieces and count != self._count:
+        if len(piece) < 3 or not piece[0] < piece[1] <= MAX_PIECES:
+            raise Malformed("a piece that does not exist, or is empty")
+        if self._pieces and piece[1] != self.count:
             self._pieces = {}
             raise Malformed("the number of pieces changed")
-        self._count = count
-        self._pieces.setdefault(index, data)
-        if len(self._pieces) < count:
+        self.count = piece[1]
+        self._pieces.setdefault(piece[0], piece[2:])
+        if len(self._pieces) < self.count:
             return None
-        return b"".join(self._pieces[i] for i in range(count))
+        return b"".join(self._pieces[index] for index in range(self.count))
 
 
 def fields(parts: Sequence[bytes]) -> bytes:
@@ -141,22 +161,20 @@ def fields(parts: Sequence[bytes]) -> bytes:
     return b"".join(len(part).to_bytes(2, "big") + part for part in parts)
 
 
-def parse_fields(body: bytes, count: int) -> tuple[list[bytes], list[int]]:
-    """Exactly `count` fields, then nothing but zeros; and offsets in `body`: where each field begins, and the end."""
-    parts: list[bytes] = []
-    offsets: list[int] = []
-    position = 0
-    for _ in range(count):
-        start = position + 2
-        stop = start + int.from_bytes(body[position:start], "big")
-        if start > len(body) or stop > len(body):
-            raise Malformed("a handshake message ends within a field")
+def parse_fields(body: bytes, lengths: Sequence[int | None]) -> tuple[list[bytes], list[int]]:
+    """Fields of exactly these lengths (None: any), then nothing but zeros; and offsets in `body`: where each field
+    begins, and the end."""
+    parts, offsets = list[bytes](), [0]
+    for length in lengths:
+        start = offsets[-1] + 2
+        stop = start + int.from_bytes(body[start - 2 : start], "big")
+        if max(start, stop) > len(body) or length not in (None, stop - start):
+            raise Malformed("a handshake message ends within a field, or a field has another length")
         parts.append(body[start:stop])
-        offsets.append(position)
-        position = stop
-    if any(body[position:]):
+        offsets.append(stop)
+    if any(body[offsets[-1] :]):
         raise Malformed("a handshake message goes on after its last field")
-    return parts, [*offsets, position]
+    return parts, offsets
 
 
 # The frame inside DATA: one, to the end of the packet

@@ -224,12 +224,10 @@ def seal(
     lines: not empty and without newline, each; none at all make a chunk without body. previous: the digest of
     the header before. compress=False stores the lines as they are, so that sizes tell nothing of the content.
     secret: a `content_secret` of the robot, for all chunks of a run; None makes one, which costs a signature.
-    TooLarge if the lines do not fit; then nothing was used up.
+    TooLarge if the lines do not fit; then nothing was used up. Malformed for another number of readers.
     """
     root, body, grants = _EMPTY, b"", b""
     if lines:
-        if not 1 <= len(readers) <= MAX_READERS:
-            raise ValueError(f"a chunk is for 1 to {MAX_READERS} readers, not {len(readers)}")
         plaintext = _pack(lines, compress, level)
         place = stream + number.to_bytes(8, "big")
         fresh = randomness(32) + log.ledger + log.tk + place + sm3.digest(plaintext)
@@ -414,11 +412,8 @@ def proofs(lines: Sequence[bytes], key: bytes, indexes: Iterable[int]) -> Iterat
     """The proof of each `lines[index]` among all the lines of a chunk (RFC 9162, 2.1.3.1)."""
     levels = _levels(_leaves(lines, key))
     for index in indexes:
-        if not 0 <= index < len(lines):
-            raise ValueError(f"there is no record {index} among {len(lines)}")
-        path = tuple(
-            level[place] for height, level in enumerate(levels[:-1]) if (place := index >> height ^ 1) < len(level)
-        )
+        beside = ((level, index >> height ^ 1) for height, level in enumerate(levels[:-1]))
+        path = tuple(level[place] for level, place in beside if place < len(level))
         yield Proof(index, next(_salts(key, [index])), path)
 
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -100,16 +101,15 @@ class Database:
                     f" PRAGMA user_version = {VERSION}; COMMIT"
                 )
                 found, version = application, VERSION
-            if found != application:
-                raise StoreError(f"{self.path} is no {self._what}; name another file")
-            if version != VERSION:
+            if (found, version) != (application, VERSION):
                 raise StoreError(
-                    f"the {self._what} {self.path} has version {version}, this program knows {VERSION} (the first"
-                    " edition had 1): finish what it holds with the edition that wrote it, then move it away"
+                    f"{self.path} is no {self._what} of version {VERSION}; name another file, or let the program that"
+                    " wrote it finish what it holds, and move it away"
                 )
             if not read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute(f"PRAGMA wal_autocheckpoint = {self._wal_pages}")
+                self._reserved()
             if self._exclusive:
                 self.check()
 
@@ -174,16 +174,14 @@ class Database:
             if self._reserve.exists() and self._reserve.stat().st_size == size:  # a crash may have cut it short
                 return True
             room = os.statvfs(self.path.parent)
-        except OSError as error:
-            raise StoreError(f"the disk of the {self._what} {self.path} fails ({error.strerror})") from None
-        if room.f_bavail * room.f_frsize < size:
-            return False
-        try:
+            if room.f_bavail * room.f_frsize < size:
+                return False
             self._reserve.write_bytes(os.urandom(size))  # what no file system compresses
-        except OSError:
-            self._reserve.unlink(missing_ok=True)
+            return True
+        except OSError:  # what is the matter, the write to the database says
+            with suppress(OSError):
+                self._reserve.unlink()
             return False
-        return True
 
     @contextmanager
     def errors(self, *, opening: bool = False) -> Iterator[None]:
@@ -201,20 +199,16 @@ class Database:
             raise StoreError(f"{where} cannot be used ({error}); what was kept before is safe") from None
 
     def _damage(self, reason: str, *, move: bool) -> StoreError:
-        number = 1
-        while (aside := self.path.with_name(f"{self.path.name}.damaged-{number}")).exists():
-            number += 1
-        salvage = f"'sqlite3 {aside} .recover' salvages what it held"
-        if not move:
-            return StoreError(
-                f"the {self._what} {self.path} is damaged ({reason}); stop what uses it, move it and the files beside"
-                f" it (-wal, -shm) to {aside}, and start again; {salvage}"
-            )
-        self.close()
-        for suffix in _BESIDE:
-            if (part := self.path.with_name(self.path.name + suffix)).exists():
-                part.rename(aside.with_name(aside.name + suffix))
+        numbered = (self.path.with_name(f"{self.path.name}.damaged-{number}") for number in count(1))
+        aside = next(path for path in numbered if not path.exists())
+        todo = f"stop what uses it, move it and the files beside it (-wal, -shm) to {aside}, and start again"
+        if move:
+            todo = f"it is kept as {aside}; start again, with an empty one"
+            self.close()
+            for suffix in _BESIDE:
+                if (part := self.path.with_name(self.path.name + suffix)).exists():
+                    part.rename(aside.with_name(aside.name + suffix))
         return StoreError(
-            f"the {self._what} {self.path} is damaged ({reason}) and was kept as {aside}; start again to go on with an"
-            f" empty {self._what}; {salvage}"
+            f"the {self._what} {self.path} is damaged ({reason}); {todo}; 'sqlite3 {aside} .recover' salvages what it"
+            " held"
         )

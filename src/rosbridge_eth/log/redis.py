@@ -24,6 +24,7 @@ one that does, and is refused whole; the others begin with one that frees, and g
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from operator import itemgetter
@@ -143,12 +144,14 @@ COMMANDS: Final = {
     "multi": (), "exec": (), "eval": ("return 1", 0), "config|get": ("appendonly",), "info": ("server",), "time": (),
     "hset": ("K", "f", 1), "hget": ("K", "f"), "hmget": ("K", "f"), "hdel": ("K", "f"), "zadd": ("K", 0, "m"),
     "zrem": ("K", "m"), "zrangebylex": ("K", "-", "+"), "zrevrange": ("K", 0, 0), "zremrangebyrank": ("K", 0, 0),
-    "sadd": ("K", "m"), "smembers": ("K",), "del": ("K",),
+    "sadd": ("K", "m"), "smembers": ("K",), "cluster|slots": (), "command": (), "del": ("K",),
 }  # fmt: skip
-"""Every command that is used here and in the scripts, with arguments to try the right to it; K: a key of its own, which
-the last one removes."""
-CLUSTER_COMMANDS: Final[dict[str, tuple[Any, ...]]] = {"cluster|slots": (), "command": ()}
-"""Those that a cluster needs besides."""
+"""Every command that is used here, in the scripts and by a cluster's client, with arguments to try the right to it.
+K: a key of its own, which the last one removes."""
+_RIGHTS: Final = " ".join(["~rosbridge-eth:*", "+client", "+select", *(f"+{name}" for name in COMMANDS)])
+"""What the user may do, as ACL SETUSER takes it."""
+_NO_RIGHT: Final = "permissions"
+"""In every error of a Redis that refuses a command for want of a right, also in that of a transaction."""
 _URL_PARTS: Final = frozenset({
     "connection_class", "db", "host", "password", "path", "port", "username",
     "ssl_ca_certs", "ssl_ca_path", "ssl_cert_reqs", "ssl_certfile", "ssl_check_hostname", "ssl_keyfile",
@@ -173,19 +176,17 @@ class RedisStore(Store):
             "protocol": 2, "socket_connect_timeout": CONNECT_TIMEOUT, "socket_timeout": ANSWER_TIMEOUT,
         }  # fmt: skip
         # No retries: the caller decides what follows a call whose answer was lost. Any: answers have no types.
-        one = redis.Redis(connection_pool=redis.ConnectionPool(**parts, **settings, retry=Retry(NoBackoff(), 0)))
-        self._redis: Any = one
-        self._cluster = False
-        self._where = _where(one)
+        pool = redis.ConnectionPool(**parts, **settings, retry=Retry(NoBackoff(), 0))
+        self._redis: Any = redis.Redis(connection_pool=pool)
+        self._where = _where(self._redis)
         try:
             with self._talking():
-                self._cluster = bool(one.info("cluster")["cluster_enabled"])
+                self._cluster = bool(self._redis.info("cluster")["cluster_enabled"])
                 if self._cluster:
-                    one.close()
+                    self._try_rights(self._redis)
+                    self._redis.close()
                     self._redis = RedisCluster.from_url(url, **settings, retry=Retry(NoBackoff(), 1))
-        except StoreError as error:
-            if isinstance(error.__context__, (redis.ResponseError, RedisClusterException)):
-                self._require_rights(one)
+        except StoreError:
             self.close()
             raise
 
@@ -300,15 +301,9 @@ class RedisStore(Store):
 
     def waiting(self, tk: bytes) -> Waiting:
         [state] = self.states([tk])
-        waiting, after = Waiting(), state.confirmed
-        while rows := self.rows(tk, after, _AT_ONCE):
-            chunks, records, size, oldest = waiting
-            waiting = Waiting(
-                chunks + len(rows), records + sum(row.records for row in rows), size + sum(row.size for row in rows),
-                min([row.taken_at for row in rows] + ([] if oldest is None else [oldest])),
-            )  # fmt: skip
-            after = rows[-1].place
-        return waiting
+        rows = self.rows(tk, state.confirmed, sys.maxsize)
+        records, size = sum(row.records for row in rows), sum(row.size for row in rows)
+        return Waiting(len(rows), records, size, min((row.taken_at for row in rows), default=None))
 
     def dead(self, limit: int = 100) -> list[DeadLetter]:
         robots = self._robots()
@@ -323,54 +318,35 @@ class RedisStore(Store):
 
     # What is asked of Redis, and talking to it
 
-    def _nodes(self) -> list[Any]:
-        """A client of every Redis that may have to hold what is stored here."""
-        if not self._cluster:
-            return [self._redis]
-        return [self._redis.get_redis_connection(node) for node in self._redis.get_nodes()]
-
     def check(self) -> None:
         with self._talking():
-            nodes = self._nodes()
-        for node in nodes:
-            self._require_rights(node)
-            with self._talking():
+            nodes = [self._redis]
+            if self._cluster:  # replicas, too: each may have to hold what is stored here
+                nodes = [self._redis.get_redis_connection(node) for node in self._redis.get_nodes()]
+            for node in nodes:
+                self._try_rights(node)
                 found = node.config_get("*append*") | node.config_get("maxmemory-policy")
-                written = node.info("persistence")["aof_last_write_status"]
-            wrong = {name: found.get(name) for name, value in _SETTINGS.items() if found.get(name) != value}
-            if wrong:
-                is_now = ", ".join(f"{name} is {value!r}" for name, value in wrong.items())
-                mend = "; ".join(f"CONFIG SET {name} {_SETTINGS[name]}" for name in wrong)
-                raise StoreError(
-                    f"{_where(node)} could lose chunks that robots were told are safe: {is_now}."
-                    f" In redis-cli: {mend}; CONFIG REWRITE"
-                )
-            if written != "ok":
-                raise StoreError(
-                    f"{_where(node)} cannot write its append-only file; see its log, make room on its disk, start again"
-                )
+                wrong = [f"CONFIG SET {name} {value}" for name, value in _SETTINGS.items() if found.get(name) != value]
+                if wrong:
+                    raise StoreError(
+                        f"{_where(node)} could lose chunks that robots were told are safe."
+                        f" In redis-cli: {'; '.join(wrong)}; CONFIG REWRITE"
+                    )
+                if node.info("persistence")["aof_last_write_status"] != "ok":
+                    raise StoreError(
+                        f"{_where(node)} cannot write its append-only file; see its log, make room on its disk, start"
+                        " again"
+                    )
 
-    def _require_rights(self, node: Any) -> None:
-        names: dict[str, tuple[Any, ...]] = COMMANDS | (CLUSTER_COMMANDS if self._cluster else {})
-        missing = dict.fromkeys(right for name in names if (right := self._lacks(node, name, names[name])))
-        if missing:
-            raise StoreError(
-                f"{_where(node)}: its user lacks rights; in redis-cli: ACL SETUSER {self._user} {' '.join(missing)}"
-                " (docs/howto-redis.md)"
-            )
-
-    def _lacks(self, node: Any, name: str, given: Sequence[Any]) -> str | None:
-        """What the user lacks to use a command, as ACL SETUSER takes it."""
-        arguments = (self._prefix + "check" if part == "K" else part for part in given)
-        try:
-            with self._talking():
-                node.execute_command(*name.split("|"), *arguments)
-        except StoreError as error:
-            if "this user has no permissions" in str(error):
-                return "~rosbridge-eth:*" if "keys" in str(error) else f"+{name}"
-            if not isinstance(error.__context__, redis.ResponseError):  # that would be about the arguments
-                raise
-        return None
+    def _try_rights(self, node: Any) -> None:
+        """redis.ResponseError unless the user may use every command."""
+        for name, arguments in COMMANDS.items():
+            try:
+                given = (self._prefix + "check" if argument == "K" else argument for argument in arguments)
+                node.execute_command(*name.split("|"), *given)
+            except redis.ResponseError as error:
+                if _NO_RIGHT in str(error):  # else it is about the arguments
+                    raise
 
     def _key(self, kind: str, tk: bytes) -> str:
         return f"{self._prefix}{{{tk.hex()}}}:{kind}"
@@ -382,7 +358,9 @@ class RedisStore(Store):
             yield
         except (redis.RedisError, RedisClusterException) as error:
             text = str(error).rstrip(".").replace(str(self._password or "\0"), "***")
-            if not isinstance(error, redis.ResponseError) or isinstance(error, ClusterError):
+            if _NO_RIGHT in text:
+                text += f"; in redis-cli: ACL SETUSER {self._user} {_RIGHTS} (docs/howto-redis.md)"
+            elif not isinstance(error, redis.ResponseError) or isinstance(error, ClusterError):
                 text += "; start Redis, or correct [store] url"
             raise StoreError(f"the store in {self._where} cannot be used: {text}") from None
 
@@ -404,11 +382,12 @@ def _parts_of(url: str) -> dict[str, Any]:
     """Keyword arguments of a connection pool. StoreError, which does not repeat the URL: a password may stand in it."""
     try:
         parts: dict[str, Any] = dict(parse_url(url))  # type: ignore[no-untyped-call]
+        if parts.keys() - _URL_PARTS:
+            raise ValueError(parts)
     except ValueError:
         raise StoreError(
-            "[store] url is not the URL of a Redis; write redis://HOST:6379/0, rediss://… for TLS or"
-            " unix:///run/redis/redis.sock, and percent-encode what is not a letter or digit in a password"
+            "[store] url is not the URL of a Redis, or has an option that is not known; write redis://HOST:6379/0,"
+            " rediss://… for TLS or unix:///run/redis/redis.sock, and percent-encode what is not a letter or digit in a"
+            " password"
         ) from None
-    for name in sorted(parts.keys() - _URL_PARTS):
-        raise StoreError(f"[store] url: the option {name!r} is not known")
     return parts

@@ -11,25 +11,17 @@ from eth_hash.auto import keccak
 
 from rosbridge_eth.errors import StoreError
 from rosbridge_eth.log.chunk import Chunk, Header
-from rosbridge_eth.log.database import Database, NothingThere
-from rosbridge_eth.log.store import (
-    DEAD_LETTERS,
-    NOWHERE,
-    DeadLetter,
-    Offer,
-    Outcome,
-    Row,
-    State,
-    Store,
-    Waiting,
-    place_of,
-    successor,
-)
+from rosbridge_eth.log.database import Database
+
+from rosbridge_eth.log.store import (  # isort: skip
+    DEAD_LETTERS, NOWHERE, DeadLetter, Offer, Outcome, Row, State, Store, Waiting, place_of, successor,
+)  # fmt: skip
 
 _APPLICATION: Final = 0x52425354  # "RBST"
 _SCHEMA: Final = """
 -- One row: whose chunks these are.
 CREATE TABLE IF NOT EXISTS store (ledger BLOB NOT NULL);
+INSERT INTO store SELECT x'{ledger}' WHERE NOT EXISTS (SELECT 1 FROM store);
 -- store.State, and the bytes of the robot's rows.
 CREATE TABLE IF NOT EXISTS robot (
     tk BLOB PRIMARY KEY, head BLOB NOT NULL, digest BLOB NOT NULL, base BLOB NOT NULL, confirmed BLOB NOT NULL,
@@ -62,27 +54,18 @@ class SqliteStore(Store):
         what: str = "store", application: int = _APPLICATION, wal_pages: int = 1000, exclusive: bool = False,
     ) -> None:  # fmt: skip
         self.max_bytes, self.max_bytes_per_robot = max_bytes, max_bytes_per_robot
-        self._where, self._ledger, self._read_only = f"the {what} {path}", ledger, read_only
+        self._where, self._ledger = f"the {what} {path}", ledger
         self._connect = partial(
-            Database, path, what, application=application, schema=_SCHEMA, wal_pages=wal_pages, exclusive=exclusive,
-            read_only=read_only,
+            Database, path, what, application=application, schema=_SCHEMA.format(ledger=ledger.hex()),
+            wal_pages=wal_pages, exclusive=exclusive, read_only=read_only,
         )  # fmt: skip
         self._open()
 
     def _open(self) -> None:
         self._db = self._connect()
-        try:
-            if not self._read_only:
-                make = "INSERT INTO store SELECT ? WHERE NOT EXISTS (SELECT 1 FROM store)"
-                self._db.write(lambda: self._db.run(make, (self._ledger,)))
-            found = self._read("SELECT ledger FROM store")
-            if not found:
-                raise NothingThere(f"there is nothing in {self._where} yet")
-            if found[0][0] != self._ledger:
-                raise StoreError(f"{self._where} is for another contract or chain; move it away")
-        except BaseException:
+        if self._read("SELECT ledger FROM store") != [(self._ledger,)]:
             self.close()
-            raise
+            raise StoreError(f"{self._where} is for another contract or chain; move it away")
 
     def close(self) -> None:
         self._db.close()

@@ -41,8 +41,6 @@ class LogWriter:
         previous: bytes, newest: bytes = bytes(chunk.STREAM_SIZE), stream_line: bytes, period: float = 1.0,
         heartbeat: float = 3600.0, compress: bool = True, now: float, randomness: Randomness = secrets.token_bytes,
     ) -> None:
-        if period <= 0 or heartbeat <= 0:
-            raise ValueError(f"period and heartbeat are above 0, not {period} and {heartbeat}")
         self._log, self._key, self._readers = log, key, tuple(readers)
         self._previous, self._stream_line = previous, _check(stream_line)
         self._period, self._heartbeat, self._compress = period, heartbeat, compress
@@ -147,6 +145,4 @@ class LogWriter:
 def _check(line: bytes) -> bytes:
     if len(line) > MAX_LINE:
         raise TooLarge(f"a line of {len(line)} bytes does not fit a chunk; the most is {MAX_LINE}")
-    if not line or b"\n" in line:
-        raise ValueError("a line is not empty and holds no newline")
     return line

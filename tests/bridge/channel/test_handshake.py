@@ -42,9 +42,8 @@ from rosbridge_eth.channel import (
     Server,
     ServerConfig,
 )
-from rosbridge_eth.channel.events import Refused
 from rosbridge_eth.channel.handshake import Agreed, ClientHandshake, answer_proof
-from rosbridge_eth.channel.wire import HELLO_PADDING, Hello, Kind
+from rosbridge_eth.channel.wire import HELLO_PADDING, Hello, Kind, Refused
 
 BOTH = (Mode.EXCHANGE, Mode.TRANSPORT)
 modes = pytest.mark.parametrize("mode", BOTH, ids=lambda mode: mode.name.lower())

@@ -180,12 +180,9 @@ def test_an_end_takes_no_more_than_there_is_room_for(monkeypatch):
     assert 9_000 <= steps.client.room() < 10_000
     with pytest.raises(Full):
         steps.client.send(bytes(10_000))
-    with pytest.raises(ValueError, match="at most"):
+    with pytest.raises(Full):
         steps.client.send(bytes(72 * 1024 + 1))
     connection = steps.connection
-    for state in (b"", bytes(MAX_STATE + 1)):
-        with pytest.raises(ValueError, match="a state has 1 to 600 bytes"):
-            steps.server.set_state(connection, state)
     steps.server.close()
     steps.server.set_state(connection, b"to nobody")
     steps.client.close(steps.now)

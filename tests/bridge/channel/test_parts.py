@@ -15,17 +15,19 @@ from bridge.channel.steps import Steps, events
 from rosbridge_eth.channel import Drop, Message
 from rosbridge_eth.channel.admission import Cookies, TokenBucket
 from rosbridge_eth.channel.delivery import GAIN, INITIAL_WINDOW, MINIMUM_WINDOW, QUEUE_SHARE, RoundTrip, Window
-from rosbridge_eth.channel.events import Refused
-from rosbridge_eth.channel.protection import Direction, ReplayWindow
+from rosbridge_eth.channel.protection import WINDOW, Direction, ReplayWindow
 from rosbridge_eth.channel.transfer import Receiving
-from rosbridge_eth.channel.wire import ACK_BITS, MAX_STATE, Answer, Hello, Malformed, Mode, fields, parse_fields
+
+from rosbridge_eth.channel.wire import (  # isort: skip
+    ACK_BITS, MAX_STATE, Answer, Hello, Malformed, Mode, Refused, fields, parse_fields,
+)  # fmt: skip
 
 
-@given(st.lists(st.integers(0, 5000), max_size=300))
+@given(st.lists(st.integers(0, 10_000), max_size=300))
 def test_the_replay_window_takes_each_number_once_and_nothing_too_old(numbers):
-    window, seen, highest = ReplayWindow(1024), set(), -1
+    window, seen, highest = ReplayWindow(), set(), -1
     for number in numbers:
-        expected = number in seen or number <= highest - 1024
+        expected = number in seen or number <= highest - WINDOW
         assert window.seen(number) == expected
         if not expected:
             window.mark(number)
@@ -41,7 +43,7 @@ def test_the_replay_window_is_at_least_1024_wide_and_does_not_grow():
     assert tracemalloc.get_traced_memory()[1] < 100_000  # no integer of 2**31 bits on the way
     tracemalloc.stop()
     assert not window.seen(2**31 - 1024) and window.seen(0)
-    assert window.bits.bit_length() <= window.size
+    assert window.bits.bit_length() <= WINDOW
 
 
 @given(st.lists(st.integers(0, 2000), min_size=1, max_size=150), st.binary(max_size=MAX_STATE))
@@ -66,16 +68,19 @@ def test_any_bytes_are_an_answer_or_malformed(data):
     assert answer.bits & 1 and answer.bits.bit_length() <= min(answer.largest + 1, ACK_BITS)
 
 
-@given(st.lists(st.binary(max_size=60), max_size=9), st.binary(min_size=1, max_size=3))
-def test_fields_come_back_and_nothing_but_zeros_may_follow(parts, more):
+@given(st.lists(st.binary(max_size=60), max_size=9), st.binary(min_size=1, max_size=3), st.randoms())
+def test_fields_come_back_and_nothing_but_zeros_may_follow(parts, more, draw):
     body = fields(parts)
-    assert parse_fields(body, len(parts))[0] == parse_fields(body + bytes(7), len(parts))[0] == parts
+    lengths = [draw.choice((None, len(part))) for part in parts]
+    assert parse_fields(body, lengths)[0] == parse_fields(body + bytes(7), lengths)[0] == parts
     if any(more):
         with pytest.raises(Malformed):
-            parse_fields(body + more, len(parts))
+            parse_fields(body + more, lengths)
     if parts:
         with pytest.raises(Malformed):
-            parse_fields(body[:-1], len(parts))
+            parse_fields(body[:-1], lengths)
+        with pytest.raises(Malformed):
+            parse_fields(body, [*lengths[:-1], len(parts[-1]) + 1])
 
 
 @given(st.lists(st.binary(max_size=1300), max_size=40), st.randoms())
@@ -86,12 +91,12 @@ def test_messages_are_cut_out_of_any_segments_and_segments_come_in_any_order(pay
     draw.shuffle(numbered)
     counts = Counter[str]()
     receiving = Receiving(counts, 1000)
+    messages = []
     for index, data in numbered:
-        assert not receiving.known(index)
-        assert receiving.take(index, data)
-        assert receiving.known(index)
-    assert receiving.messages == payloads
-    assert counts["early"] == 0
+        messages += receiving.take(index, data)
+        assert receiving.take(index, b"a duplicate") == []
+    assert messages == payloads
+    assert (counts["early"], counts["duplicates"]) == (0, len(numbered))
 
 
 def rounds(window: Window, rtt: float, delivered: float, count: int = 1, now: float = 1.0) -> int:

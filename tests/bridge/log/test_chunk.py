@@ -134,7 +134,7 @@ def test_a_robot_cannot_seal_what_readers_would_not_take():
         with pytest.raises(ValueError, match="line"):
             sealed(lines)
     for count in (0, 17):
-        with pytest.raises(ValueError, match="readers"):
+        with pytest.raises(Malformed):
             sealed(readers=[READER.public_key] * count)
 
 

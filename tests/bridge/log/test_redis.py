@@ -448,20 +448,18 @@ def test_a_cluster_of_which_one_node_may_lose_chunks_is_refused(cluster):
 
 @pytest.mark.parametrize("name", ["cluster|slots", "command", "zadd"])
 def test_the_rights_for_a_cluster_are_those_of_the_page_and_each_that_is_missing_is_named(redis_cluster, name):
-    assert "`+cluster|slots +command` besides" in HOWTO.read_text(encoding="utf-8")
     url = redis_cluster.url.replace("redis://", "redis://bridge:PASSWORD@")
     for node in redis_cluster.nodes:
         with node.client() as client:
             client.execute_command("ACL", "SETUSER", "bridge", "reset")
             client.execute_command(*documented_acl())
-            client.execute_command("ACL", "SETUSER", "bridge", "+cluster|slots", "+command")
     store = open_url(url, name.encode().ljust(32))
     use_everything(store)
     store.close()
     for node in redis_cluster.nodes:
         with node.client() as client:
             client.execute_command("ACL", "SETUSER", "bridge", f"-{name}")
-    with pytest.raises(StoreError, match=rf"ACL SETUSER bridge \+{re.escape(name)} \("):
+    with pytest.raises(StoreError, match=rf"ACL SETUSER bridge .*\+{re.escape(name)} "):
         open_url(url).check()
 
 
@@ -522,22 +520,22 @@ def test_each_right_that_is_missing_is_named_with_the_command_that_gives_it(redi
         client.execute_command("ACL", "SETUSER", "bridge", "reset")
         client.execute_command(*documented_acl())
         client.execute_command("ACL", "SETUSER", "bridge", f"-{name}")
-        with pytest.raises(StoreError, match="lacks rights") as refusal:
+        with pytest.raises(StoreError, match=f"permissions.*{re.escape(name)}") as refusal:
             as_bridge(redis_server, ledger=ledger).check()
-        assert f"ACL SETUSER bridge +{name} (" in str(refusal.value)
-        mend = re.search(r"ACL SETUSER [^(]*", str(refusal.value))
-        client.execute_command(*mend.group().split())
+        fix = re.search(r"ACL SETUSER [^(]*", str(refusal.value))
+        client.execute_command(*fix.group().split())
     store = as_bridge(redis_server, ledger=ledger)
     use_everything(store)
     store.close()
 
 
-def test_all_that_is_missing_is_named_at_once_and_the_keys_too(server):
+def test_the_command_gives_all_that_is_missing_at_once_and_the_keys_too(server):
     with server.client() as client:
         client.execute_command(*documented_acl())
-        client.execute_command("ACL", "SETUSER", "bridge", "-zadd", "-hset", "-config|get")
-        with pytest.raises(StoreError, match=r"SETUSER bridge \+config\|get \+hset \+zadd \("):
+        client.execute_command("ACL", "SETUSER", "bridge", "-zadd", "-hset", "-config|get", "resetkeys")
+        with pytest.raises(StoreError, match="permissions") as refusal:
             as_bridge(server).check()
-        client.execute_command("ACL", "SETUSER", "bridge", "+zadd", "+hset", "+config|get", "resetkeys")
-        with pytest.raises(StoreError, match=r"SETUSER bridge ~rosbridge-eth:\* \("):
-            as_bridge(server).check()
+        client.execute_command(*re.search(r"ACL SETUSER [^(]*", str(refusal.value)).group().split())
+    store = as_bridge(server)
+    use_everything(store)
+    store.close()

@@ -295,14 +295,14 @@ def test_a_database_of_another_kind_is_refused_and_left_alone(path):
     assert list(path.parent.glob("*damaged*")) == []
 
 
-@pytest.mark.parametrize(("version", "says"), [(1, "first edition"), (99, "version 99")])
-def test_one_of_the_first_edition_or_a_newer_one_is_refused_and_left_alone(path, spool, version, says):
+@pytest.mark.parametrize("version", [1, 99])
+def test_one_of_the_first_edition_or_a_newer_one_is_refused_and_left_alone(path, spool, version):
     spool.close()
     other = sqlite3.connect(path)
     other.execute(f"PRAGMA user_version = {version}")
     other.close()
     before = path.read_bytes()
-    with pytest.raises(StoreError, match=says):
+    with pytest.raises(StoreError, match="is no spool of version 2"):
         open_spool(path)
     assert path.read_bytes() == before
 

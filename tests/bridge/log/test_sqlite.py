@@ -61,14 +61,14 @@ def test_a_place_where_no_file_can_be_is_told(tmp_path, name):
         open_file(tmp_path / name)
 
 
-@pytest.mark.parametrize(("version", "says"), [(1, "first edition"), (3, "version 3")])
+@pytest.mark.parametrize("version", [1, 3])
 @pytest.mark.parametrize("read_only", [False, True])
-def test_one_of_the_first_edition_or_a_newer_one_is_refused(path, version, says, read_only):
+def test_one_of_the_first_edition_or_a_newer_one_is_refused(path, version, read_only):
     open_file(path).close()
     other = sqlite3.connect(path)
     other.execute(f"PRAGMA user_version = {version}")
     other.close()
-    with pytest.raises(StoreError, match=says):
+    with pytest.raises(StoreError, match="is no store of version 2"):
         open_file(path, read_only=read_only)
 
 
