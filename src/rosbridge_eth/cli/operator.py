@@ -269,8 +269,6 @@ def register(
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if asked is None:
         talk(f"Its keys were made here: who has this home and its passphrase can sign as {name}.")
-    if made.unfunded:
-        talk(f"It was given no ETH yet ({made.unfunded}); nothing is written for it until the server can give it some.")
     if made.buried:
         talk(f"Dead letters now: {counted(made.buried, 'chunk')} of the old {name}; `status` lists them.")
     talk(f"It seals for these readers: {', '.join(made.readers)}.")

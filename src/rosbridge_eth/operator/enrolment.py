@@ -25,7 +25,7 @@ from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreEr
 from rosbridge_eth.files import read_file, write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
-from rosbridge_eth.ledger.contract import BALANCE_LIMIT, WEI_PER_ETH
+from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.log.chunk import MAX_READERS, robot_id
 from rosbridge_eth.log.store import NOWHERE, Store
@@ -38,7 +38,6 @@ from rosbridge_eth.config.home import (  # isort: skip
 )  # fmt: skip
 
 OPERATOR = "operator"  # what the treasury's account is called
-ACCOUNTS_TRIED = 1000
 HANDING_OVER = 2.0  # seconds after which no session of a name out of force is left: the server looks every second
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
 LAST_WRITES = 20.0  # the same, where a robot is revoked and not replaced: then its right ends all the same
@@ -133,8 +132,7 @@ def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: by
     """
     made = home.path / ".server.new"
     shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
-    names = (f"server.until-{now:%Y%m%dT%H%M%SZ}{suffix}" for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
-    old = next(home.path / name for name in names if not (home.path / name).exists())
+    old = home.path / f"server.until-{now:%Y%m%dT%H%M%S.%fZ}"
     with Registry(home.registry) as registry:
         identity = ids.enrol(ca, Role.SERVER, SERVER, at=now)
         ids.save_identity(made, identity, [ca.certificate], passphrase)
@@ -282,14 +280,12 @@ def _make_reader(
 class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
-    unfunded: why its account was given no ETH, if it was not; the server gives it some later. buried: chunks of the one
-    that bore the name before which became dead letters. readers: for whom the robot seals.
+    buried: chunks of the one that bore the name before which became dead letters. readers: for whom the robot seals.
     """
 
     account: str
     block: int
     bundle: Path
-    unfunded: str | None
     buried: int
     readers: Sequence[str]
 
@@ -358,15 +354,10 @@ def register_robot(
     made = Bundle(end, text, readers, private).signed(ca.key)
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
-    unfunded = None
-    try:
-        if (has := ledger.balance(account)) < int(config.funds.below * WEI_PER_ETH):  # its first chunk need not wait
-            ledger.alloc_eth(keys.operator, account, min(int(config.funds.by * WEI_PER_ETH), BALANCE_LIMIT - has))
-    except OutOfFunds:
-        unfunded = "the operator's account has none for it"
-    except ChainError as error:
-        unfunded = str(error)
-    return Registered(account, block, path, unfunded, buried, sorted(readers))
+    with suppress(ChainError):  # then the server gives it some with its first chunk
+        if ledger.balance(account) < int(config.funds.below * WEI_PER_ETH):
+            ledger.alloc_eth(keys.operator, account, int(config.funds.by * WEI_PER_ETH))
+    return Registered(account, block, path, buried, sorted(readers))
 
 
 def _register(
@@ -374,18 +365,15 @@ def _register(
 ) -> tuple[int, str, int]:
     """Register on the chain with the next account that serves no other robot: number, account and block."""
     put = ledger.registration if standing.account is None else ledger.replace_registration
-    first = registry.next_number()
-    for number in range(first, first + ACCOUNTS_TRIED):
+    number = registry.next_number()
+    while True:
         account = keys.robot(number).address
         try:
             return number, account, put(keys.operator, tk, account, certificates).block
         except Reverted as refused:
             if refused.name != "AccountInUse":  # by a robot that a registry from an older backup does not know
                 raise
-    raise StoreError(
-        f"the contract knows the accounts {first} to {first + ACCOUNTS_TRIED - 1} of this home and the registry does"
-        " not: restore registry.sqlite from a newer backup"
-    )
+            number += 1
 
 
 def _waiting(inbox: Callable[[], Store], tk: bytes, patience: float, pause: Callable[[float], None]) -> int:
@@ -435,12 +423,12 @@ def revoke(
     with Registry(home.registry) as registry:
         known = any(enrolment.name == name for enrolment in registry.all(role))
         in_force = registry.revoke(role, name, now)
-    nobody = f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
+    nobody = IdentityError(f"no {role} {name!r} is in force; `status` lists them")
     if role is not Role.ROBOT:
         if known and role is Role.READER:  # also where it was cut short before
             (home.readers / f"{name}.pem").unlink(missing_ok=True)
         if not in_force:
-            raise IdentityError(nobody)
+            raise nobody
         return Revoked(None)
     tk = robot_id(name)
     try:
@@ -448,12 +436,12 @@ def revoke(
         [standing] = ledger.standings([tk])
         ended = standing.account is None or standing.revoked
         if ended and not known:
-            raise IdentityError(nobody)
+            raise nobody
         if in_force or not ended:
             _waiting(inbox, tk, 0.0 if compromised or ended else LAST_WRITES, pause)
         buried = _bury(inbox, ledger, tk, f"{name} was revoked")
         if ended and not in_force and not buried:
-            raise IdentityError(nobody)
+            raise nobody
         return Revoked(None if ended else ledger.revoke_robot(keys.operator, tk).block, buried)
     except (ChainError, StoreError) as error:
         raise type(error)(
