@@ -1,14 +1,8 @@
 """What the processes count: served at /metrics, and saved in the home, where `status` finds it.
 
-<<<<<<< HEAD
-A shard of the server, and a robot, has its figures in its own memory; prometheus_client serves them on the port that
-`monitor` names. Every two seconds it saves them in a file of its home, too (`.shard-0.prom`, `.robot.prom`), which it
-removes at its end: a file that was not touched for SILENCE is of a process that was killed, or hangs.
-=======
 A shard of the server, or a robot, keeps its figures in memory. Every two seconds it saves them in a file of its home
 (`.shard-0.json`, `.robot.json`), which it removes when it ends: a file older than SILENCE belongs to a process that was
 killed or hangs. With `monitor`, prometheus_client serves them, too. docs/operations.md says what each figure is.
->>>>>>> next
 """
 
 from __future__ import annotations
