@@ -24,6 +24,12 @@ from rosbridge_eth.errors import SourceError, VerificationError
 _SECOND: Final = 10**9
 _UINT32: Final = 2**32
 NOT_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+_LIMITS: Final[dict[str, tuple[type, float, float]]] = {
+    base: (float, -float(numpy.finfo(kind).max), float(numpy.finfo(kind).max)) if kind.kind == "f"
+    else (int, numpy.iinfo(kind).min, numpy.iinfo(kind).max)
+    for base, kind in NUMBERS.items() if kind.kind != "b"
+}  # fmt: skip
+"""Of the numbers' types, Python's own, and the least and the highest value."""
 _ABSENT: Final = object()
 """Stands for a value that was not captured."""
 
@@ -150,20 +156,14 @@ def _is_numeric(element: FieldDesc) -> bool:
 def _scalar(base: str, data: Any) -> Any:
     if base == "string":
         return _exactly(str, data)
-    kind = NUMBERS[base]
-    if kind.kind == "b":
+    if base not in _LIMITS:
         return _exactly(bool, data)
-    if kind.kind == "f":
-        if isinstance(data, str) and data in NOT_FINITE:
-            return NOT_FINITE[data]
-        largest = float(numpy.finfo(kind).max)
-        fits = -largest <= _exactly(float, data) <= largest
-    else:
-        limits = numpy.iinfo(kind)
-        if base == "byte" and 127 < _exactly(int, data) < 256:
-            data -= 256  # it is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed
-        fits = limits.min <= _exactly(int, data) <= limits.max
-    if not fits:
+    exact, least, most = _LIMITS[base]
+    if exact is float and isinstance(data, str) and data in NOT_FINITE:
+        return NOT_FINITE[data]
+    if base == "byte" and 127 < _exactly(int, data) < 256:
+        data -= 256  # it is signed in ROS 1, unsigned in ROS 2; rosbags packs it as signed
+    if not least <= _exactly(exact, data) <= most:
         raise ValueError
     return data
 

@@ -57,7 +57,7 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
 
     Records that were received a SLACK before the bag begins or after it ends are not looked at; nearer to its ends, one
     without a message is no difference, unless it is the record before it once more.
-    topics: none for all of the bag's; one of these without a single record is `absent`, and no difference.
+    topics: none for all of the bag's; then one without a single record is `absent`, and no difference.
     some: the robot captured only some of the messages, by a rate or period; those that it did not are no difference.
     """
     source = BagSource(bag, Selection(topics or ["/**"]))
@@ -65,8 +65,7 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
     waiting: dict[str, deque[RawMessage]] = {topic: deque() for topic in source.decoders()}
     unmet = dict.fromkeys(waiting, 0)  # of the topics that had no record yet, messages that should have had one
     early: dict[str, list[MessageLine]] = {topic: [] for topic in waiting}  # until the first record inside the bag
-    unlike: dict[str, list[tuple[int, str]]] = {topic: [] for topic in waiting}  # before the first that is like one
-    live: dict[str, bool] = {}  # of topics of which a record was like a message: received at another time than that
+    replayed = set[str]()  # topics of which a record has a message's own receive time
     previous: dict[str, MessageLine] = {}
 
     def missing(raw: RawMessage) -> None:
@@ -78,24 +77,17 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
     def judge(record: MessageLine) -> None:
         topic, time, mine = record.topic, record.received_ns, waiting[record.topic]
         before, wrong = _message_of(record, mine)
-        here = bool(mine) and (wrong is None or any(raw.received_ns == time for raw in mine))
-        if not here and not first <= time <= last:
+        at_its_time = any(raw.received_ns == time for raw in mine)
+        if at_its_time:
+            replayed.add(topic)
+        elif wrong is not None:
+            at_an_end = (topic in unmet and time < first + SLACK) or (not mine and time > last - SLACK)
+            if first <= time <= last and (topic in replayed or not at_an_end):
+                made.differ(topic, time, wrong)
             return
-        if not here and topic in unlike and time < first + SLACK:
-            unlike[topic].append((time, wrong or ""))
-            return
-        if not here and not mine and live.get(topic) and time > last - SLACK:
-            return
-        if wrong is None:
-            live[topic] = mine[before].received_ns != time
-        if not live.get(topic) or before or unmet.get(topic):
-            for at_ns, why in unlike.get(topic, ()):
-                made.differ(topic, at_ns, why)
-        unlike.pop(topic, None)
         for _ in range(before):
             missing(mine.popleft())
-        if here:
-            mine.popleft()
+        mine.popleft()
         if (count := unmet.pop(topic, 0)) and not some:
             made.differ(topic, time, f"the chain has no record of {counted(count, 'message')} before this one")
         if wrong is None:
@@ -130,16 +122,13 @@ def compare(bag: Path, topics: Sequence[str], records: Iterable[MessageLine], *,
             judge(record)
         for record in (record for rest in early.values() for record in rest):
             judge(record)
-        for topic, held in unlike.items():
-            for at_ns, why in held:
-                made.differ(topic, at_ns, why)
         for rest in (*waiting.values(), [] if ahead is None else [ahead], messages):
             for raw in rest:
                 missing(raw)
     finally:
         source.close()
     for topic, count in unmet.items():
-        if topics and count:
+        if count and (topics or topic in previous):
             made.differ(topic, first, f"the chain has no record of any of this topic's messages; the bag has {count:,}")
         else:
             made.absent.append(shown(topic))

@@ -115,12 +115,6 @@ const evidence = (() => {
     const x = mod(r * r - hhh - 2n * v)
     return [x, mod(r * (v - x) - sa * hhh), (((h * a[2]) % P) * b[2]) % P]
   }
-  function inverse(value) {
-    let [a, b, x, y] = [mod(value), P, 1n, 0n]
-    while (a > 1n) [a, b, x, y] = [b % a, a, y - (b / a) * x, x]
-    return mod(x)
-  }
-
   // key: 04 | x | y; the signature's r and s; identifier 1234567812345678 (GM/T 0009).
   function signed(key, message, r, s) {
     const [x, y] = [big(key.subarray(1, 33)), big(key.subarray(33))]
@@ -140,8 +134,8 @@ const evidence = (() => {
       if (which) sum = add(sum, sums[which])
     }
     if (sum[2] === 0n) return false
-    const i = inverse(sum[2])
-    return (e + ((sum[0] * ((i * i) % P)) % P)) % N === r
+    const expected = mod(r - e, N) // of the point's x, which is below P, modulo N
+    return [expected, expected + N].some((value) => value < P && mod(value * sum[2] * sum[2] - sum[0]) === 0n)
   }
 
   // ---------------------------------------------------------------- DER and X.509, RFC 5280

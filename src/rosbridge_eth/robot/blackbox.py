@@ -78,10 +78,13 @@ class Condition(NamedTuple):
         """A function that says whether it holds for a message of this type, or raises DecodeError. ConfigError where
         the type has no such field, or one of another kind than the constant."""
         path, compare = parse_path(self.field), _OPERATORS[self.sign]
-        conversion = Conversion(decoder, parse_paths([self.field]), limit=MAX_RAW)
         wanted = {bool: "true or false", str: "a string"}.get(type(self.value), "a number")
-        if (found := _kind(path, decoder)) != wanted:
-            raise ConfigError(f"{self.field} of {decoder.type_name} is {found}, and compared with {wanted}")
+        try:
+            conversion = Conversion(decoder, parse_paths([self.field]), limit=MAX_RAW)
+            if (found := _kind(path, decoder)) != wanted:
+                raise ConfigError(f"{self.field} of {decoder.type_name} is {found}, and compared with {wanted}")
+        except ConfigError as error:
+            raise ConfigError(f"the condition {self.text!r} never holds: {error}") from None
         stands_for = NOT_FINITE if wanted == "a number" else {}
 
         def holds(raw: RawMessage) -> bool:
@@ -130,7 +133,7 @@ class Ring:
     def __init__(self, length_ns: int, memory: int) -> None:
         self._length, self._memory = length_ns, memory
         self._records: deque[Record] = deque()
-        self._early: dict[int, Counter[str]] = {}  # by second of receipt: topics of what was removed before its time
+        self._early = Counter[tuple[int, str]]()  # by second of receipt and topic: what was removed before its time
         self.bytes = 0
 
     def __len__(self) -> int:
@@ -144,20 +147,21 @@ class Ring:
         while self._records and (self._records[0].received_ns < since_ns or self.bytes > self._memory):
             gone = self._records.popleft()
             self.bytes -= OVERHEAD + len(gone.line)
-            second = gone.received_ns // SECOND
-            if gone.received_ns >= since_ns and second not in self._early:
-                # Later ones are from before the clock was set back.
-                kept = {key: topics for key, topics in self._early.items() if since_ns // SECOND <= key <= second}
-                self._early = kept | {second: Counter()}
-            if gone.received_ns >= since_ns:
-                self._early[second][gone.topic] += 1
+            if gone.received_ns < since_ns:
+                continue
+            second, early = gone.received_ns // SECOND, self._early
+            if (second, gone.topic) not in early:  # later seconds are from before the clock was set back
+                self._early = Counter({key: early[key] for key in early if since_ns // SECOND <= key[0] <= second})
+            self._early[second, gone.topic] += 1
 
     def take(self, at_ns: int) -> tuple[list[Record], Counter[str]]:
         """All that is kept at this time, which is then empty; and what was removed early, by topic."""
         since_ns = at_ns - self._length
         # All are looked at: a clock that was set back leaves records of the future in front of older ones.
         records = [record for record in self._records if record.received_ns >= since_ns]
-        early = sum((held for second, held in self._early.items() if second >= since_ns // SECOND), Counter[str]())
+        early = Counter[str]()
+        for (second, topic), count in self._early.items():
+            early[topic] += count if second >= since_ns // SECOND else 0
         self._records.clear()
         self._early.clear()
         self.bytes = 0
@@ -208,11 +212,8 @@ class BlackBox:
 
     def check(self, topic: str, decoder: Decoder) -> None:
         """ConfigError now, rather than at the first message, if a condition does not fit the topic's type."""
-        for trigger, condition in self._conditions.get(topic, ()):
-            try:
-                condition.compiled(decoder)
-            except ConfigError as error:
-                raise ConfigError(f"trigger {trigger.rule.name}: {condition.text!r} never holds: {error}") from None
+        for _, condition in self._conditions.get(topic, ()):
+            condition.compiled(decoder)
 
     def look(self, raw: RawMessage) -> None:
         """Whether this message is an event; every message of a condition's topic is looked at, captured or not."""
@@ -226,7 +227,7 @@ class BlackBox:
         try:
             return condition.compiled(decoder)
         except ConfigError as error:
-            log.error("%r does not hold for this type: %s", condition.text, error)
+            log.error("%s", error)
             return lambda raw: False
 
     def keep(self, name: str, record: Record) -> None:

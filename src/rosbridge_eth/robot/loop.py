@@ -22,12 +22,12 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TypeVar
 
-from rosbridge_eth.capture import Capture, RawMessage, Record, TopicRule, stream_line
+from rosbridge_eth.capture import Capture, RawMessage, Record, stream_line
 from rosbridge_eth.channel import Client, ClientConfig, Event, Mode
 from rosbridge_eth.channel.udp import ClientLoop
 from rosbridge_eth.config import RobotConfig, load_robot_config, reread
 from rosbridge_eth.config.home import RobotHome
-from rosbridge_eth.config.values import Address, counted, parse_address, time_text
+from rosbridge_eth.config.values import Address, counted, parse_address
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
@@ -35,7 +35,7 @@ from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
-from rosbridge_eth.robot.sources import BagSource, Selection, Source, open_source
+from rosbridge_eth.robot.sources import Selection, Source, open_source
 from rosbridge_eth.robot.sources.queue import Queue
 from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.terminal import Trouble
@@ -393,8 +393,6 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
         for decoder in decoders:
             capture.check(topic, decoder)  # a field that a type does not have is told now, not at its first message
             box.check(topic, decoder)
-    if isinstance(source, BagSource):
-        _say_what_is_outside(config.rules(), source.span)
     place = Log(end.ledger, robot_id(identity.name))
     key = identity.signing_key
     spool = Spool(home.spool, place, max_bytes=config.spool.max_size, drop=partial(drop, place, key))
@@ -436,16 +434,3 @@ def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConf
         return running
     log.warning("%s", said)
     return config
-
-
-def _say_what_is_outside(rules: Sequence[TopicRule], span: tuple[int, int]) -> None:
-    """A rule that nothing in a recording can meet captures nothing, and would do so without a word."""
-    first, last = span
-    if first > last:
-        return  # the source has said that it replays nothing
-    for rule in rules:
-        if max(rule.at_ns or 0, rule.from_ns or 0) > last or (rule.until_ns is not None and rule.until_ns <= first):
-            log.warning(
-                "%s: `at`, `from` or `until` leaves nothing to capture: what is replayed of the recording goes from"
-                " %s to %s", rule.topic, time_text(first), time_text(last),
-            )

@@ -89,11 +89,6 @@ class BagSource(Source):
             found[topic].append(decoder)
         return found
 
-    @property
-    def message_count(self) -> int:
-        """Messages of the watched topics in the whole bag."""
-        return sum(connection.msgcount for connection, *_ in self._watched.values())
-
     def messages(self) -> Iterator[RawMessage]:
         """The watched messages, in order, without waiting, until the end or `close`. Raises SourceError."""
         if self._reader is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Final
 
@@ -32,11 +32,10 @@ class Queue:
     def __init__(self, size: int, *, waits: bool) -> None:
         self._size, self._waits = size, waits
         self._changed = threading.Condition()
-        self._messages: OrderedDict[int, RawMessage] = OrderedDict()  # by number of arrival
-        self._numbers: dict[str, deque[int]] = {}  # of each topic, oldest first
+        self._messages: deque[RawMessage] = deque()
         self._bytes = Counter[str]()  # of each topic
+        self._total = 0
         self._dropped = Counter[str]()
-        self._next = self._total = 0
         self._closed = False
 
     def __len__(self) -> int:
@@ -56,13 +55,12 @@ class Queue:
             first = not self._messages
             while not self._waits and self._total + size > self._size:
                 largest = max(self._bytes, key=self._bytes.__getitem__)
-                self._pop(self._numbers[largest][0])
+                oldest = next(number for number, each in enumerate(self._messages) if each.topic == largest)
+                self._count(self._messages[oldest], -1)
+                del self._messages[oldest]
                 self._drop(largest)
-            self._messages[self._next] = message
-            self._numbers.setdefault(topic, deque()).append(self._next)
-            self._bytes[topic] += size
-            self._total += size
-            self._next += 1
+            self._messages.append(message)
+            self._count(message, 1)
             return first
 
     def take(self) -> RawMessage | None:
@@ -72,7 +70,9 @@ class Queue:
                 return None
             if self._waits and self._total <= self._size // 2:  # not at each message: waking a thread costs more
                 self._changed.notify_all()
-            return self._pop(next(iter(self._messages)))
+            message = self._messages.popleft()
+            self._count(message, -1)
+            return message
 
     def close(self) -> None:
         """Keep nothing more, and let nobody wait; what is there can still be taken."""
@@ -85,14 +85,10 @@ class Queue:
         """Messages that had to make room, by topic and "dropped"."""
         return {(topic, "dropped"): count for topic, count in dict(self._dropped).items()}
 
-    def _pop(self, number: int) -> RawMessage:
-        """Of its topic, a message is always the oldest when it leaves."""
-        message = self._messages.pop(number)
-        size = len(message.raw) + OVERHEAD
-        self._numbers[message.topic].popleft()
-        self._bytes[message.topic] -= size
-        self._total -= size
-        return message
+    def _count(self, message: RawMessage, sign: int) -> None:
+        size = sign * (len(message.raw) + OVERHEAD)
+        self._bytes[message.topic] += size
+        self._total += size
 
     def _drop(self, topic: str) -> None:
         self._dropped[topic] += 1

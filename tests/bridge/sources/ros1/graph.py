@@ -171,7 +171,8 @@ class Listening:
     def connected(self, topic: str) -> int:
         """Publishers of the topic that are being read."""
         known = self.source._topics.get(topic)
-        return sum(each.publication is not None for each in known.publishers.copy().values()) if known else 0
+        publishers = known.publishers.copy().values() if known else ()
+        return sum(each.connected and not each.over.is_set() for each in publishers)
 
     def numbers(self, topic: str) -> list[int]:
         return [data["data"] for data in self.data.get(topic, ())]

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosbridge_eth.robot.sources import Selection
-from rosbridge_eth.robot.sources.ros1 import api, source
+from rosbridge_eth.robot.sources.ros1 import api
 from rosbridge_eth.robot.sources.ros1.api import ProtocolError
-from rosbridge_eth.robot.sources.ros1.source import FIRST_RETRY, LAST_RETRY, STEADY, Publisher, Ros1Source
-from rosbridge_eth.robot.sources.ros1.tcpros import Publication
+from rosbridge_eth.robot.sources.ros1.source import Publisher, Ros1Source
 
 API = "http://me:1/"
 
@@ -80,26 +79,21 @@ def connected(script: Script, topic: str) -> list[str]:
     return list(state.publishers) if state is not None else []
 
 
-def ends(publisher: Publisher) -> None:
+def ends(publisher: Publisher, error: Exception | None = None) -> None:
     """Its connection ends, or was never made."""
     with pytest.MonkeyPatch.context() as patch:
 
         def read() -> None:
-            if asked:
-                publisher.over.set()
-            asked.append(1)
-            raise EOFError
+            raise error or EOFError
 
-        asked: list[int] = []
         patch.setattr(publisher, "_read", read)
-        patch.setattr(publisher.over, "wait", lambda _: True)
         publisher.run()
-        assert len(asked) == 1, "it is not tried again"
+    assert publisher.over.is_set()
 
 
 def read_from(publisher: Publisher) -> None:
     """As if its header had been accepted."""
-    publisher.publication = Publication("a/msg/B", "0" * 32, None, "/n")  # type: ignore[arg-type]
+    publisher.connected = True
 
 
 def test_a_named_topic_is_registered_before_anybody_publishes_it(make):
@@ -247,54 +241,20 @@ def test_a_refused_topic_does_not_keep_the_others_waiting(make, caplog):
     assert "does not take a subscription to /a: not you" in caplog.text
 
 
-def test_publishers_that_were_left_out_are_read_when_there_is_room(make, begun, monkeypatch):
-    monkeypatch.setattr(source, "MAX_CONNECTIONS", 1)
-    script = make("/a", "/b")
-    script.publishers = {"/a": ["http://x:1/"], "/b": ["http://y:1/"]}
-    script.turn()
-    assert (connected(script, "/a"), connected(script, "/b")) == (["http://x:1/"], [])
-    del script.publishers["/a"]
-    script.turn()
-    ends(begun[0])
-    script.turn()
-    assert (connected(script, "/a"), connected(script, "/b")) == ([], ["http://y:1/"])
-
-
-def test_connections_are_limited(make, begun, monkeypatch, caplog):
-    monkeypatch.setattr(source, "MAX_CONNECTIONS", 50)
-    script = make("/*")
-    script.publishers = {f"/t{n:04}": [f"http://x{n}:{m}/" for m in range(1, 6)] for n in range(100)}
-    script.turn()
-    assert len(begun) == 50
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
-
-
 ENDS = {"closed": EOFError(), "reset": ConnectionResetError(), "silent": TimeoutError(), "nonsense": ProtocolError("x")}
 
 
 @pytest.mark.parametrize("error", ENDS.values(), ids=ENDS)
-def test_attempts_come_at_longer_and_longer_intervals_until_a_connection_lasts(make, begun, monkeypatch, error):
+@pytest.mark.parametrize("before", [False, True], ids=["never read from", "read from"])
+def test_a_connection_is_made_again_at_the_next_look_and_at_once_where_it_was_good(make, begun, before, error):
     script = make("/a")
     script.publishers = {"/a": ["http://x:1/"]}
     script.turn()
-    [publisher] = begun
-    now, lasting, waits = 0.0, [0.0] * 12 + [STEADY] + [0.0] * 3, []
-
-    def connect() -> None:
-        nonlocal now
-        now += lasting.pop(0)
-        if not lasting:
-            publisher.over.set()
-        raise error
-
-    monkeypatch.setattr("time.monotonic", lambda: now)
-    monkeypatch.setattr(publisher, "_read", connect)
-    monkeypatch.setattr(publisher.over, "wait", waits.append)
-    publisher.run()
-    assert publisher.over.is_set()
-    assert waits[:7] == [FIRST_RETRY * 2**n for n in range(7)]
-    assert waits[7:12] == [LAST_RETRY] * 5
-    assert waits[12:15] == [FIRST_RETRY, FIRST_RETRY * 2, FIRST_RETRY * 4]
+    begun[0].connected = before
+    ends(begun[0], error)
+    assert script.subject._rung.is_set() == (before and not isinstance(error, ProtocolError))
+    assert script.turn() == ["registerSubscriber /a"]
+    assert [publisher.over.is_set() for publisher in begun] == [True, False]
 
 
 VALUES = st.recursive(
@@ -338,13 +298,10 @@ def test_after_a_master_that_answers_anything_one_that_answers_again_has_us_regi
             script.subject._look()
             for publisher in begun if turn["ends"] else ():
                 script.subject.ended(publisher, EOFError())
-                if publisher.uri not in publisher.topic.listed:
-                    publisher.over.set()
             uris = [(p.name, p.uri) for p in begun if not p.over.is_set()]
             assert len(uris) == len(set(uris)), "one connection for each publisher"
         for publisher in begun:  # the living ones would end one day
             script.subject.ended(publisher, EOFError())
-            publisher.over.set()
         patch.setattr(api, "call", script)
         script.publishers = {"/a": ["http://p:1/"]}
         for _ in range(4):

@@ -34,7 +34,7 @@ def types(require):
 def test_every_type_that_debian_ships_has_the_sum_that_genpy_gives_it(types):
     assert len(types) > 100
     for name, text, md5 in types:
-        publication = read_publication("/t", {"type": name, "md5sum": md5, "message_definition": text})
+        publication = read_publication({"type": name, "md5sum": md5, "message_definition": text})
         assert publication.type_name == name.replace("/", "/msg/")
 
 
@@ -43,7 +43,7 @@ def test_a_type_of_noetic_needs_no_definition(types):
     for name, text, md5 in types:
         if not name.startswith(("std_msgs/", "nav_msgs/")):
             continue
-        publication = read_publication("/t", {"type": name, "md5sum": md5, "message_definition": ""})
+        publication = read_publication({"type": name, "md5sum": md5, "message_definition": ""})
         assert publication.decoder.fields == decoder_for(Wire.ROS1, name, text).fields
 
 
@@ -63,17 +63,17 @@ def test_constants_spaces_and_comments_count_as_genpy_counts_them(require):
 
 
 def test_what_a_header_says_is_kept():
-    publication = read_publication("/t", {**STRING, "callerid": "/talker", "latching": "1", "topic": "/t"})
+    publication = read_publication({**STRING, "callerid": "/talker", "latching": "1", "topic": "/t"})
     assert (publication.type_name, publication.node) == ("std_msgs/msg/String", "/talker")
 
 
 def test_the_reasons_of_a_refusal_are_told():
     with pytest.raises(Refusal, match="the publisher refuses: go away"):
-        read_publication("/t", {"error": "go away"})
+        read_publication({"error": "go away"})
     with pytest.raises(DefinitionError, match=r"has the md5 sum 992c.*, not '0000"):
-        read_publication("/t", {**STRING, "md5sum": "0" * 32})
+        read_publication({**STRING, "md5sum": "0" * 32})
     with pytest.raises(DefinitionError, match="does not define a/msg/B"):
-        read_publication("/t", {**STRING, "type": "a/B", "message_definition": ""})
+        read_publication({**STRING, "type": "a/B", "message_definition": ""})
 
 
 def test_a_subscriber_asks_for_any_type():
@@ -88,7 +88,7 @@ def test_a_subscriber_asks_for_any_type():
 )  # fmt: skip
 def test_any_header_is_a_publication_or_refused(fields, complete):
     with contextlib.suppress(SourceError):
-        read_publication("/t", {**STRING, **fields} if complete else fields)
+        read_publication({**STRING, **fields} if complete else fields)
 
 
 LINES = st.one_of(

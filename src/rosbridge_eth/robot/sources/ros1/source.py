@@ -8,8 +8,9 @@ state is looked at, and what is missing is done:
     we are subscribed to a topic that is not wanted            unregister
 
 So a master that was restarted is told again. Publishers do not register again at a restarted master: a connection is
-closed when it ends or its topic is not wanted, and made again if the master lists the publisher. Anyone may call our
-API, so nothing is believed from there but that it is time to look.
+kept until it ends or its topic is not wanted. When it has ended, there is a look at once, and it is made again if the
+master lists the publisher; one that could not be made waits for the next look. Anyone may call our API, so nothing is
+believed from there but that it is time to look.
 """
 
 from __future__ import annotations
@@ -39,15 +40,8 @@ RESOLVE_EVERY: Final = 3.0
 """Seconds after which new topics and nodes are looked for."""
 REST: Final = 0.1
 """Seconds between looks at the least, however often the master calls."""
-MAX_CONNECTIONS: Final = 512
-"""Connections to publishers at once: threads, and file descriptors, of which a process usually has 1,024."""
 FAREWELL: Final = 0.6
 """Seconds in which the master is told that we leave."""
-FIRST_RETRY: Final = 0.1
-LAST_RETRY: Final = 10.0
-"""Seconds between attempts to reach a publisher: doubled at each failure."""
-STEADY: Final = 10.0
-"""A connection that lasted so long was a good one: the next attempt is the first again."""
 STALLED = 30.0
 """Seconds without a byte, within a message, after which a publisher is given up."""
 
@@ -82,7 +76,7 @@ class Ros1Source(LiveSource):
         self.max_message = max_message
         self._topics: dict[str, _Topic] = {}
         self._rung = threading.Event()
-        self._lock = threading.Lock()  # of the publications and the losses, in the publishers' threads
+        self._lock = threading.Lock()  # of the losses, which publishers' threads count
         self._uri = ""
 
     def offers(self) -> Sequence[Offer]:
@@ -174,10 +168,6 @@ class Ros1Source(LiveSource):
         for uri in topic.listed:
             if uri in topic.publishers or self._stop.is_set():
                 continue
-            if sum(len(each.publishers) for each in self._topics.values()) >= MAX_CONNECTIONS:
-                self._say("room", f"more than {MAX_CONNECTIONS} publishers; some of {name} are left out")
-                topic.nodes = None
-                break
             publisher = topic.publishers[uri] = Publisher(self, topic, name, uri)
             publisher.start()
 
@@ -201,18 +191,6 @@ class Ros1Source(LiveSource):
 
     # What the publishers' threads tell
 
-    def admit(self, publisher: Publisher, publication: tcpros.Publication) -> None:
-        """One type for a topic at a time, as ROS has it: that of the publishers read from already. Raises Refusal."""
-        with self._lock:
-            for other in publisher.topic.publishers.copy().values():
-                if (known := other.publication) is not None and known.md5 != publication.md5:
-                    raise api.Refusal(
-                        f"{publication.node} publishes {publication.type_name} ({publication.md5}) where "
-                        f"{known.node} publishes {known.type_name} ({known.md5})"
-                    )
-            publisher.publication = publication
-        log.info("%s: reading %s from %s", publisher.name, publication.type_name, publication.node or publisher.uri)
-
     def received(self, topic: str, publication: tcpros.Publication, body: bytes) -> None:
         """A message is complete."""
         received_ns = self._clock.wall_ns()
@@ -227,24 +205,25 @@ class Ros1Source(LiveSource):
 
     def ended(self, publisher: Publisher, error: Exception) -> None:
         """A connection was not made, or was lost, or was ended by us for what came."""
-        connected, publisher.publication = publisher.publication is not None, None
         if publisher.over.is_set():
             return
+        publisher.over.set()
         publisher.topic.nodes = None  # it may have started anew somewhere else
         text = f"{publisher.name}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
-        if connected and not isinstance(error, SourceError):
+        if publisher.connected and not isinstance(error, SourceError):
             log.info("%s", text)
+            self._rung.set()
         else:
             self._say(f"publisher {publisher.name} {publisher.uri}", f"{text}; trying again")
 
 
 class Publisher(threading.Thread):
-    """Reads one publisher of one topic, again and again, until the master does not list it any more or it is closed."""
+    """Reads one publisher of one topic until the connection ends or is closed."""
 
     def __init__(self, node: Ros1Source, topic: _Topic, name: str, uri: str) -> None:
         super().__init__(name=name, daemon=True)
         self.topic, self.uri = topic, uri
-        self.publication: tcpros.Publication | None = None
+        self.connected = False
         self.over = threading.Event()
         self._node = node
         self._socket: socket.socket | None = None
@@ -257,20 +236,10 @@ class Publisher(threading.Thread):
                 sock.shutdown(socket.SHUT_RDWR)
 
     def run(self) -> None:
-        wait = FIRST_RETRY
-        while not self.over.is_set():
-            began = time.monotonic()
-            try:
-                self._read()
-            except api.FAILURES as error:
-                self._node.ended(self, error)
-            if self.uri not in self.topic.listed:
-                break
-            if time.monotonic() - began >= STEADY:
-                wait = FIRST_RETRY
-            self.over.wait(wait)
-            wait = min(LAST_RETRY, 2 * wait)
-        self.over.set()
+        try:
+            self._read()
+        except api.FAILURES as error:
+            self._node.ended(self, error)
 
     def _read(self) -> None:
         """Ask it where it listens, connect, and read messages until it ends. Raises FAILURES."""
@@ -284,8 +253,9 @@ class Publisher(threading.Thread):
                 return
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a machine may go without a word
             sock.sendall(tcpros.request_header(self.name, node.caller_id))
-            publication = tcpros.read_publication(self.name, tcpros.read_header(stream))
-            node.admit(self, publication)
+            publication = tcpros.read_publication(tcpros.read_header(stream))
+            self.connected = True
+            log.info("%s: reading %s from %s", self.name, publication.type_name, publication.node or self.uri)
             while True:
                 sock.settimeout(None)  # between messages, silence is no fault
                 length = tcpros.read_length(stream)

@@ -31,7 +31,6 @@ class Publication(NamedTuple):
     """What comes over one connection."""
 
     type_name: str
-    md5: str
     decoder: Decoder
     node: str
 
@@ -87,14 +86,12 @@ def pass_over(stream: BinaryIO, length: int) -> None:
         length -= len(read_exactly(stream, min(length, _PIECE)))
 
 
-def read_publication(topic: str, fields: Mapping[str, str]) -> Publication:
+def read_publication(fields: Mapping[str, str]) -> Publication:
     """Judge the answer to our header. Raises Refusal, ProtocolError or DefinitionError."""
     if "error" in fields:
         raise Refusal(f"the publisher refuses: {fields['error'][:200]}")
     if missing := {"type", "md5sum"} - fields.keys():
         raise ProtocolError(f"the publisher's header has no {min(missing)}")
-    if fields.get("topic", topic) != topic:
-        raise ProtocolError(f"the publisher's header is for another topic, {fields['topic'][:60]!r}")
     if fields["type"] == ANY:
         raise Refusal("the publisher does not say which type it sends")
     name, md5, text = normalised_type_name(fields["type"]), fields["md5sum"].lower(), fields.get("message_definition")
@@ -103,4 +100,4 @@ def read_publication(topic: str, fields: Mapping[str, str]) -> Publication:
         raise DefinitionError(f"the publisher does not define {name}, and ROS Noetic does not ship it")
     if decoder.definition.md5 != md5:
         raise DefinitionError(f"the definition of {name} has the md5 sum {decoder.definition.md5}, not {md5[:60]!r}")
-    return Publication(name, md5, decoder, fields.get("callerid", "")[:256])
+    return Publication(name, decoder, fields.get("callerid", "")[:256])
