@@ -98,11 +98,11 @@ def test_more_readers_than_a_chunk_may_have_are_refused_before_it_is_sealed_for_
     home.config.write_text(ODOM + '[source]\nkind = "sim"\n')
     for number in range(MAX_READERS - 1):
         (home.readers / f"reader_{number}.pem").write_bytes(READER.public.pem)
-    config, roots = load_robot_config(home.config), [CA.certificate]
-    assert len(reader_keys(config, home, roots)) == MAX_READERS
+    roots = [CA.certificate]
+    assert len(reader_keys(home, roots)) == MAX_READERS
     (home.readers / "one_more.pem").write_bytes(READER.public.pem)
-    with pytest.raises(ConfigError, match="there are 17 readers, and a chunk is for 16 at most"):
-        reader_keys(config, home, roots)
+    with pytest.raises(ConfigError, match="certificates of 17 readers, and a chunk is for 1 to 16"):
+        reader_keys(home, roots)
 
 
 def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
@@ -134,15 +134,15 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
 
     monkeypatch.setattr(socket, "getaddrinfo", away)
     robot = opened(place, f'server = "robots.example:7410"\n{ODOM}{BAG}')
-    captured = len(list(robot.source.messages()))  # type: ignore[attr-defined]
+    captured, figures = len(list(robot.source.messages())), list[object]()  # type: ignore[attr-defined]
 
     def on_turn() -> None:
-        metrics.show(metrics.of_robot("robot_1", robot, 0.0))
+        figures[:] = metrics.of_robot("robot_1", robot, 0.0)
         if robot.captured == captured and robot.sender.refusal:
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert metrics.CONDITION.labels("robot", "server's name has an address")._value.get() == 0
+    assert ("condition", {"process": "robot", "name": "server's name has an address"}, False) in figures
     [said] = warnings(caplog)
     why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
     assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary
