@@ -14,7 +14,7 @@ that was ever sealed; its number says how many the stream has.
 letter nor in the spool. `doubled` counts chunks that the chain has more than
 once. Both have to be 0, whatever the fault.
 
-The network between robot and server is a relay (rosbridge_eth.cli.relay) that
+The network between robot and server is a relay (relay.py) that
 loses, doubles and reorders; `tc netem` needs a kernel with sch_netem.
 """
 
@@ -44,8 +44,8 @@ from pathlib import Path
 
 import rosbridge_eth
 from ports import free_port
+from relay import Harm, Relay
 from rosbridge_eth.capture import Capture, MessageLine, TopicRule, parse_line
-from rosbridge_eth.cli.relay import Harm, Relay
 from rosbridge_eth.config import load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.identity import Trust, load_identity

@@ -39,7 +39,7 @@ from rosbridge_eth.log.hop import FORKED, ServerState
 from rosbridge_eth.log.sqlite import SqliteStore
 from rosbridge_eth.log.store import NOWHERE, Offer, Outcome, Store, place_of
 from rosbridge_eth.log.writer import LogWriter
-from rosbridge_eth.robot.sender import TWICE, Sender
+from rosbridge_eth.robot.sender import REFUSED_RIGHT, TWICE, Sender
 from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.server.reception import AWAY, HELD, MISMATCH, NO_ROOM, Reception
 
@@ -558,6 +558,48 @@ def test_no_chunk_that_the_server_never_had_leaves_the_disk_at_its_word(tmp_path
     world.robot.restart()
     assert world.run(60)
     assert world.stored_lines() == world.lines
+
+
+def test_a_chunk_that_is_right_is_not_set_aside_whatever_the_server_says(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As one that is of another contract by mistake, or has a defect: more would be set aside than is kept."""
+    world = World(tmp_path, 5, Faults())
+    right, world.reception._ledger = world.reception._ledger, bytes(32)
+    for _ in range(3):
+        world.robot.capture(5)
+    world.run(20, until=lambda: bool(world.sender.held))
+    world.robot.capture(5)
+    world.pass_time(20)
+    assert world.sender.held == REFUSED_RIGHT and told(caplog, "sender").count(REFUSED_RIGHT) == 1
+    assert len(world.robot.chunks()) == 4 and world.robot.spool.statistics().aside == 0
+    world.restart_server()
+    world.reception._ledger = right
+    world.pass_time(60)
+    assert world.run(60)
+    assert world.stored_lines() == world.lines
+
+
+@pytest.mark.parametrize("at", [0, 18, 34, 60, 138, 260, -1])
+def test_a_chunk_that_the_disk_changed_is_set_aside_and_the_others_go_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, at: int
+) -> None:
+    """at: which byte: version, place, previous, time, number of grants, signature, body."""
+    world = World(tmp_path, 5, Faults())
+    for _ in range(3):
+        world.robot.capture(5)
+    bad = world.robot.chunks()[1]
+    changed = bytearray(bad.encoded)
+    changed[at] ^= 1
+    world.robot.spool.close()
+    with closing(sqlite3.connect(tmp_path / "robot" / "spool.sqlite")) as disk, disk:
+        disk.execute("UPDATE chunk SET chunk = ? WHERE digest = ?", (bytes(changed), bad.header.digest))
+    world.robot.restart()
+    world.robot.capture(5)
+    assert world.run(20)
+    assert world.stored_lines() == [line for line in world.lines if line not in lines_of(bad)]
+    assert world.sender.refused == 1 and world.robot.spool.statistics().aside == 1
+    assert world.reception.counts["refused"] <= 1 and "set aside" in told(caplog, "sender")
 
 
 @pytest.mark.parametrize("time", [2**64 - 1, MAX_TIME_MS, MAX_TIME_MS - 1])

@@ -12,6 +12,7 @@ import threading
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
+from socket import socket
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,8 +23,7 @@ from bridge.secrecy import betrayed, leaves
 from rosbridge_eth.channel import handshake
 from rosbridge_eth.channel.protection import SessionSecrets
 from rosbridge_eth.cli import demo
-from rosbridge_eth.cli.demo import DemoResult, run_demo
-from rosbridge_eth.cli.relay import Harm
+from rosbridge_eth.cli.demo import DemoResult, LossySocket, run_demo
 from rosbridge_eth.identity import load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger, nodes
 from rosbridge_eth.log.chunk import MAX_READERS, Chunk, content_key, robot_id
@@ -32,6 +32,23 @@ from rosbridge_eth.terminal import LOGGER, TextFormatter
 from smcrypto import sm2
 
 PLACES = ("network", "chain", "operator's home", "spool", "logs")
+
+
+class RecordedSocket(LossySocket):
+    """Loses a tenth of the datagrams, and keeps all that come in and go out."""
+
+    def __init__(self, sock: socket, seen: list[bytes]) -> None:
+        super().__init__(sock, 0.1)
+        self.seen = seen
+
+    def recvfrom(self, *arguments: Any) -> Any:
+        received = super().recvfrom(*arguments)
+        self.seen.append(received[0])
+        return received
+
+    def sendto(self, *arguments: Any) -> int:
+        self.seen.append(arguments[0])
+        return super().sendto(*arguments)
 
 
 class Seen:
@@ -52,7 +69,7 @@ class Seen:
         logger.setLevel(logging.DEBUG)  # which the loggers below it have to be told
         try:
             self.result: DemoResult = run_demo(
-                folder, sample_bag(), harm=Harm(loss=0.1, duplicate=0.05, reorder=0.05), on_datagram=datagrams.append
+                folder, sample_bag(), network=lambda sock: RecordedSocket(sock, datagrams)
             )
         finally:
             logger.setLevel(level)

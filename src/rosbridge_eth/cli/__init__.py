@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import sqlite3
 import sys
-from collections.abc import Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperGroup
@@ -24,40 +24,68 @@ from smcrypto import __version__
 
 INTERRUPTED = 130  # as shells say it of Ctrl-C; typer, too
 
-GROUPS = {
-    "All": ("demo", "status", "doctor", "backup", "passwd"),
-    "Operator": ("up", "init", "chain", "deploy", "register", "server", "revoke", "renew", "reader", "mnemonic",
-                 "handover"),
-    "Robot": ("join", "topics", "robot", "trigger"),
-    "Reader": ("read", "compare", "evidence", "verify", "grant"),
-}
+COMMANDS: Final[dict[str, dict[str, tuple[Callable[..., None], str]]]] = {
+    "All": {
+        "demo": (demo.demo, "demo --report demo-report"),
+        "status": (status.status, "status robot_1; rosbridge-eth status --home robot"),
+        "doctor": (doctor.doctor, "doctor --home robot --passphrase-file password"),
+        "backup": (operator.backup, "backup copy-of-operator"),
+        "passwd": (operator.passwd, "passwd --home robot"),
+    },
+    "Operator": {
+        "up": (operator.up, "up; rosbridge-eth up --chain http://127.0.0.1:8545"),
+        "init": (operator.init, "init --chain http://127.0.0.1:8545"),
+        "chain": (operator.chain, "chain --port 8545"),
+        "deploy": (operator.deploy, "deploy --wait 60"),
+        "register": (operator.register, "register robot_1 request.json"),
+        "server": (operator.server, "server; rosbridge-eth server --shard 2"),
+        "revoke": (operator.revoke, "revoke robot_1"),
+        "renew": (operator.renew, "renew"),
+        "reader": (operator.add_reader, "reader analyst --to analyst"),
+        "mnemonic": (operator.mnemonic, "mnemonic"),
+        "handover": (operator.handover, "handover 0x5aAe…; rosbridge-eth handover --home new"),
+    },
+    "Robot": {
+        "join": (robot.join, "join --name robot_1 --source ros1 --topic /odom"),
+        "topics": (topics.topics, "topics --source drive.bag"),
+        "robot": (robot.robot, "robot --home robot --verbose"),
+        "trigger": (robot.trigger, "trigger crash"),
+    },
+    "Reader": {
+        "read": (reader.read, "read robot_1 --topic /robot_1/odom > records.jsonl;"
+                              " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"),
+        "compare": (reader.compare, "compare my.bag robot_1 --topic /robot_1/odom"),
+        "evidence": (reader.evidence, "evidence robot_1 crash.html --at 2026-11-21T10:00:00Z"),
+        "verify": (reader.verify, "verify crash.html --ca ca.crt.pem"),
+        "grant": (reader.grant, "grant robot_1 --from 2026-11-21T10:00:00Z --to 2026-11-21T10:05:00Z"
+                                " --reader insurer.pem"),
+    },
+}  # fmt: skip
+"""By who gives it: each command's name, function and an example, in the order in which they are needed."""
 
 
 class _Grouped(TyperGroup):
-    """Commands by who gives them, in the order in which they are needed; what is in no group comes last."""
+    """Shows the commands in these groups."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        named = {name for names in GROUPS.values() for name in names}
-        others = tuple(name for name in self.list_commands(ctx) if name not in named)
-        for title, names in (*GROUPS.items(), ("Other", others)):
-            found = [(name, command) for name in names if (command := self.get_command(ctx, name)) is not None]
-            if found:
-                with formatter.section(title):
-                    formatter.write_dl([(name, command.get_short_help_str(70)) for name, command in found])
+        for title, names in COMMANDS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(70)) for name in names])
 
 
 app = typer.Typer(
     name="rosbridge-eth",
     cls=_Grouped,
     help="From the name of a ROS topic to a verified record on an Ethereum chain.\n\n"
-    "Begin with `demo`; docs/walkthrough.md goes through everything else in ten minutes.",
+    "Begin with `demo`; docs/walkthrough.md shows all parts in ten minutes.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (demo, operator, robot, topics, reader, status, doctor):
-    part.add_commands(app)
+for _commands in COMMANDS.values():
+    for _name, (_function, _example) in _commands.items():
+        app.command(_name, epilog=f"Example: rosbridge-eth {_example}")(_function)
 
 
 def _version(wanted: bool) -> None:

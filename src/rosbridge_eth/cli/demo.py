@@ -6,69 +6,48 @@ processes are threads. What comes back is compared with the bag's messages, fiel
 
 from __future__ import annotations
 
+import random
 import secrets
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
+from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from socket import socket
+from string import Template
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.table import Table
 
-from rosbridge_eth.channel.udp import UdpLoop, server_socket
+from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
 from rosbridge_eth.errors import BridgeError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
+from rosbridge_eth.ledger import Keyring, Ledger
+from rosbridge_eth.operator import enrolment
 from rosbridge_eth.operator.bundle import Request, ask_to_join, join, read_bundle
-from rosbridge_eth.operator.registry import Registry
-from rosbridge_eth.reading import ProvenRecord, Verdict, read_robot
+from rosbridge_eth.reading import ProvenRecord, Verdict, outputs, read_robot
+from rosbridge_eth.reading.compare import Comparison, compare
+from rosbridge_eth.robot.loop import Robot, open_robot
 from rosbridge_eth.robot.sources import sample_bag
 from rosbridge_eth.robot.topics import robot_toml
+from rosbridge_eth.server.shard import Secrets, Shard, open_shard, open_store
 from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
-
-if TYPE_CHECKING:
-    from rosbridge_eth.cli.relay import Harm
-    from rosbridge_eth.reading.compare import Comparison
-    from rosbridge_eth.robot.loop import Robot
-    from rosbridge_eth.server.shard import Shard
 
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
 SETTLE = 60.0  # seconds for the last chunk to be confirmed
-PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>From a topic to the chain and back</title>
-<meta name="viewport" content="width=device-width">
-<style>
-body {{ margin: 2rem auto; max-width: 70rem; padding: 0 1rem; font: 1rem/1.5 system-ui, sans-serif; color: #222 }}
-div {{ overflow-x: auto }} img {{ max-width: min(100%, 40rem) }} h2 {{ font-size: 1.1rem; margin: 2rem 0 .5rem }}
-table {{ border-collapse: collapse }} th, td {{ padding: .25rem 1rem .25rem 0; text-align: left }}
-th {{ border-bottom: 1px solid #999; font-weight: 600 }}
-.number {{ text-align: right; font-variant-numeric: tabular-nums }}
-.verdict {{ border-left: .3rem solid {colour}; padding: .5rem 1rem; background: #f4f4f4 }}
-</style>
-<h1>From a topic to the chain and back</h1>
-<p class="verdict">{verdict}</p>
-<p>The records as JSON lines: <a href="records.jsonl">records.jsonl</a>.</p>
-"""
 PICTURE = '<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain">'
-
-
-@dataclass(slots=True)
-class Stages:
-    """How many records reached each stage, and how long each took (seconds)."""
-
-    captured: int = 0
-    chunks: int = 0
-    stored: int = 0
-    verified: int = 0
-    times: dict[str, float] = field(default_factory=dict)
+NO_PICTURE = "<p>With matplotlib, the trajectory is drawn here: pip install 'pysmcrypto[plot]'</p>"
 
 
 class Transaction(NamedTuple):
@@ -83,9 +62,11 @@ class Transaction(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """Everything the report shows."""
+    """Everything the report shows. times: of each step, seconds."""
 
-    stages: Stages
+    captured: int
+    chunks: int
+    times: Mapping[str, float]
     transactions: tuple[Transaction, ...]
     verdict: Verdict
     records: tuple[ProvenRecord, ...]
@@ -98,7 +79,25 @@ class DemoResult:
         """Every captured record came back, proven, equal to the bag's, once, and the robot has said goodbye."""
         head, equal = self.verdict.head, self.comparison.equal
         said = self.verdict.sound and head is not None and head.goodbye and not self.comparison.differences
-        return said and self.stages.captured == equal == len(self.records) > 0
+        return said and self.captured == equal == len(self.records) > 0
+
+
+class LossySocket(socket):
+    """A server's socket on a network that loses this share of the datagrams, each way."""
+
+    def __init__(self, sock: socket, loss: float) -> None:
+        super().__init__(fileno=sock.detach())
+        self.setblocking(False)
+        self._loss = loss
+
+    def recvfrom(self, *arguments: Any) -> Any:
+        while True:
+            received = super().recvfrom(*arguments)
+            if random.random() >= self._loss:  # noqa: S311 - a bad network, not a secret
+                return received
+
+    def sendto(self, *arguments: Any) -> int:
+        return super().sendto(*arguments) if random.random() >= self._loss else 0  # noqa: S311
 
 
 @contextmanager
@@ -116,25 +115,18 @@ def _serving(shard: Shard) -> Iterator[Callable[[], None]]:
 
 
 def run_demo(
-    folder: Path, bag: Path, *, topics: Sequence[str] = (f"/{ROBOT}/odom",), harm: Harm | None = None,
-    on_datagram: Callable[[bytes], None] = lambda data: None, on_stage: Callable[[str], None] = lambda text: None,
-    on_progress: Callable[[Stages], None] = lambda stages: None, on_turn: Callable[[Robot], None] = lambda robot: None,
+    folder: Path, bag: Path, *, topics: Sequence[str] = (f"/{ROBOT}/odom",),
+    network: Callable[[socket], socket] = lambda sock: sock, on_step: Callable[[str], None] = lambda text: None,
+    on_turn: Callable[[Robot], None] = lambda robot: None,
 ) -> DemoResult:  # fmt: skip
     """Run everything in `folder` (empty or absent), with fresh keys that are of no use afterwards.
 
-    harm: what the network between robot and server does to datagrams; nothing by default. on_datagram: is shown each
-    of them. on_stage: is told what begins. on_turn: is given the robot at each turn of its loop.
+    network: makes the server's socket that of a worse network. on_step: is told what begins. on_turn: is given the
+    robot at each turn of its loop.
     """
-    from rosbridge_eth.cli.relay import Harm, Relay
-    from rosbridge_eth.ledger import Keyring, Ledger
-    from rosbridge_eth.ledger.nodes import EmbeddedChain
-    from rosbridge_eth.operator import enrolment as administration
-    from rosbridge_eth.reading.compare import compare
-    from rosbridge_eth.robot.loop import open_robot
-    from rosbridge_eth.server.reception import Worker
-    from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
+    from rosbridge_eth.ledger.nodes import EmbeddedChain  # which imports web3
 
-    started, stages = time.monotonic(), Stages()
+    started, times = time.monotonic(), dict[str, float]()
     home, robot_home, reader_home = (
         OperatorHome(folder / "operator"), RobotHome(folder / "robot"), ReaderHome(folder / "reader")
     )  # fmt: skip
@@ -142,70 +134,61 @@ def run_demo(
     now = datetime.now(UTC)
 
     @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        on_stage(name)
+    def step(name: str) -> Iterator[None]:
+        on_step(name)
         began = time.perf_counter()
         yield
-        stages.times[name] = time.perf_counter() - began
+        times[name] = time.perf_counter() - began
 
-    with stage("keys and certificates"):
-        administration.init_home(
+    with step("keys and certificates"):
+        enrolment.init_home(
             home, passphrase, reader=reader_home, reader_passphrase=reader_passphrase, now=now, listen="127.0.0.1:0",
             public="127.0.0.1:7410",
         )
         keys = Keyring.load(home.accounts, passphrase)
         ask_to_join(robot_home, ROBOT, password)
-    with stage("chain and contract"):
+    with step("chain and contract"):
         chain = EmbeddedChain(fund={keys.operator.address: FUNDS})
-        deployment = administration.deploy_contract(home, chain, keys)
+        deployment = enrolment.deploy_contract(home, chain, keys)
         ledger = Ledger.connect(chain, deployment)
-    config, registry = load_server_config(home.config), Registry(home.registry)
-    with stage("registration"):
-        made = administration.register_robot(
+    config = load_server_config(home.config)
+    with step("registration"):
+        made = enrolment.register_robot(
             home, ROBOT, ca=load_ca(home.ca, passphrase, now), keys=keys, ledger=ledger, now=now,
             inbox=lambda: open_store(config, home, 0), request=Request.decode(robot_home.request.read_bytes()),
         )
         join(robot_home, read_bundle(made.bundle.read_bytes()))
 
-    sock = server_socket(config.listen)
-    inbox, identity = open_store(config, home, 0), administration.load_server_identity(home, passphrase)
-    reception = open_reception(config, identity, home, registry, inbox)
-    submitter = open_submitter(config, ledger, open_store(config, home, 0), registry, keys)
-    shard = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
-    with closing(Relay(sock.getsockname()[:2], harm or Harm(), on_datagram)) as relay:
-        # Short chunks, so that there are several.
-        more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
-        robot_home.config.write_text(f'server = "127.0.0.1:{relay.port}"\n{robot_toml(topics, str(bag))}{more}')
-        robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
+    sock, inbox = network(server_socket(config.listen)), open_store(config, home, 0)
+    shard = open_shard(config, home, Secrets(enrolment.load_server_identity(home, passphrase), keys), ledger, sock)
+    # Short chunks, so that there are several.
+    more = 'speed = "max"\n[log]\nperiod = "50ms"\n'
+    robot_home.config.write_text(f'server = "127.0.0.1:{sock.getsockname()[1]}"\n{robot_toml(topics, str(bag))}{more}')
+    robot = open_robot(robot_home, load_robot_config(robot_home.config), password)
 
-        with _serving(shard) as check:
+    with _serving(shard) as check:
 
-            def progress() -> None:
+        def turn() -> None:
+            check()
+            on_turn(robot)
+
+        with step("replay and delivery over UDP"):
+            robot.run(on_turn=turn)
+        turn()
+        with step("last batches"):
+            deadline = time.monotonic() + SETTLE
+            while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
                 check()
-                stages.captured, stages.chunks = robot.captured, robot.chunks
-                stages.stored = reception.records[ROBOT]
-                on_progress(stages)
-                on_turn(robot)
-
-            with stage("replay and delivery over UDP"):
-                robot.run(on_turn=progress)
-            progress()
-            with stage("last batches"):
-                deadline = time.monotonic() + SETTLE
-                while any(inbox.waiting(tk).chunks for tk in inbox.sizes()):
-                    check()
-                    if time.monotonic() > deadline:
-                        raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
-                    time.sleep(0.02)
-    with stage("fetch, open and verify"):
+                if time.monotonic() > deadline:
+                    raise BridgeError(f"not everything is in a block after {SETTLE:.0f} s; run the demo again")
+                time.sleep(0.02)
+    with step("fetch, open and verify"):
         reader, roots = load_identity(reader_home.path, reader_passphrase)
         reading = read_robot([ledger], ROBOT, trust=Trust(roots), reader=reader.encryption_key, now=time.time())
         records = tuple(reading.records())
         verdict = reading.verdict()
-    with stage("comparison with the bag"):
+    with step("comparison with the bag"):
         comparison = compare(bag, topics, [record.content for record in records])
-    stages.verified = comparison.equal
-    on_progress(stages)
     transactions = [
         Transaction(event.block, len(event.chunks), sum(map(len, event.chunks)),
                     0 if (receipt := ledger.receipt(event.transaction)) is None else receipt.gas_used,
@@ -213,7 +196,8 @@ def run_demo(
         for event in ledger.data_events(reading.verifier.log.tk, 0, ledger.block_number())
     ]  # fmt: skip
     return DemoResult(
-        stages, tuple(transactions), verdict, records, comparison, deployment.contract, time.monotonic() - started
+        robot.captured, robot.chunks, times, tuple(transactions), verdict, records, comparison, deployment.contract,
+        time.monotonic() - started,
     )
 
 
@@ -229,16 +213,12 @@ def _html(table: Table) -> str:
 # The command
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth demo --report demo-report")(demo)
-
-
 def demo(
     report: Annotated[Path, typer.Option(help="Folder for the report; made if absent.")] = Path("demo-report"),
     bag: Annotated[Path | None, typer.Option(help="A bag of your own; without it, the sample.")] = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics to take; without it, /robot_1/odom.")] = None,
     loss: Annotated[float, typer.Option(
-        min=0, max=0.9, help="Lose this share of the datagrams, and reorder and double some.")] = 0.0,
+        min=0, max=0.9, help="Lose this share of the datagrams.")] = 0.0,
 ) -> None:
     """See it work: a bag onto a chain and back, proven and compared.
 
@@ -246,32 +226,28 @@ def demo(
 
     Exits with 9 if a single record is missing, altered or doubled.
     """
-    from rosbridge_eth.cli.relay import Harm
-    from rosbridge_eth.reading import outputs
-
     log_to_stderr()
     report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
     with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
-        def show(stages: Stages) -> None:
-            progress.update(f"{stages.captured} records captured, {stages.stored} lines stored by the server")
+        def show(robot: Robot) -> None:
+            progress.update(f"{robot.captured} records captured, {robot.sender.confirmed} chunks on the chain")
 
         result = run_demo(
-            Path(home), chosen, topics=topics, harm=Harm(loss, loss / 4, loss / 2),
-            on_stage=lambda text: errors.print(f"· {text}"), on_progress=show,
+            Path(home), chosen, topics=topics, network=lambda sock: LossySocket(sock, loss),
+            on_step=lambda text: errors.print(f"· {text}"), on_turn=show,
         )
     (report / "records.jsonl").write_text("".join(map(outputs.json_line, result.records)), encoding="utf-8")
-    trajectory = outputs.Trajectory()
-    for record in result.records:
-        trajectory.write(record)
-    picture = PICTURE if trajectory.draw(report / "trajectory.png") else ""
-    stages = result.stages
-    counts = list(zip(
-        ("records captured", "chunks of the robot's log", "lines stored by the server", "records equal to the bag's"),
-        (stages.captured, stages.chunks, stages.stored, stages.verified), strict=True,
-    ))  # fmt: skip
-    times = [(name, f"{seconds * 1000:.0f} ms") for name, seconds in stages.times.items()]
+    picture = NO_PICTURE
+    if find_spec("matplotlib"):
+        trajectory = outputs.Trajectory()
+        for record in result.records:
+            trajectory.write(record)
+        picture = PICTURE if trajectory.draw(report / "trajectory.png") else ""
+    counts = [("records captured", result.captured), ("chunks of the robot's log", result.chunks),
+              ("records equal to the bag's", result.comparison.equal)]  # fmt: skip
+    times = [(name, f"{seconds * 1000:.0f} ms") for name, seconds in result.times.items()]
     heads = ("block", "chunks", "bytes", "gas", "gas/record", "transaction")
     share = len(result.records) / max(1, sum(each.bytes for each in result.transactions))  # records a byte
     batches = [
@@ -286,12 +262,14 @@ def demo(
     ]
     passed = "Every record came back, proven and equal to the bag's." if result.passed else "Not all came back."
     lines = "<br>".join(escape(line) for line in (f"{passed} The bag is {chosen.name}.", *said))
-    page = PAGE.format(colour="#2a7" if result.passed else "#c33", verdict=lines) + picture
-    (report / "report.html").write_text(page + "".join(map(_html, tables)), encoding="utf-8")
+    page = Template((resources.files(__package__) / "report.html").read_text("utf-8")).substitute(
+        colour="#2a7" if result.passed else "#c33", verdict=lines, picture=picture, tables="".join(map(_html, tables))
+    )
+    (report / "report.html").write_text(page, encoding="utf-8")
     data.print(*tables)
     for line in said:
         talk(line)
     if not result.passed:
         raise VerificationError("not every record came back as it is in the bag; the lines above say which")
-    talk(f"{stages.verified} of {stages.captured} records came back from the chain, proven and equal to the bag's, "
-         f"in {result.seconds:.1f} s. The report is {report / 'report.html'}.")
+    talk(f"{result.comparison.equal} of {result.captured} records came back from the chain, proven and equal to the"
+         f" bag's, in {result.seconds:.1f} s. The report is {report / 'report.html'}.")

@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 from urllib.parse import urlsplit
 
 import typer
@@ -20,10 +20,14 @@ from rosbridge_eth.config.values import Address, counted
 from rosbridge_eth.errors import ChainError, ConfigError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
+from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.log.chunk import robot_id
-from rosbridge_eth.operator import status
+from rosbridge_eth.log.store import Store
+from rosbridge_eth.operator import enrolment, status
 from rosbridge_eth.operator.bundle import Request
 from rosbridge_eth.reading.verdict import grouped
+from rosbridge_eth.server.parent import Parent
+from rosbridge_eth.server.shard import Secrets, open_store
 from rosbridge_eth.terminal import (
     OPERATOR_HOME,
     READER_HOME,
@@ -36,10 +40,6 @@ from rosbridge_eth.terminal import (
     utc_now,
 )
 
-if TYPE_CHECKING:
-    from rosbridge_eth.ledger import Keyring, Ledger
-    from rosbridge_eth.log.store import Store
-
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
 _ReplaceOption = Annotated[bool, typer.Option("--replace", help="Take a used name over; the old one ends.")]
@@ -47,22 +47,6 @@ _CompromisedOption = Annotated[
     bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
 
 FUNDS = 1000  # ETH that the operator has on a local chain
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth up; rosbridge-eth up --chain http://127.0.0.1:8545")(up)
-    app.command(epilog="Example: rosbridge-eth init --chain http://127.0.0.1:8545")(init)
-    app.command(epilog="Example: rosbridge-eth chain --port 8545")(chain)
-    app.command(epilog="Example: rosbridge-eth deploy --wait 60")(deploy)
-    app.command(epilog="Example: rosbridge-eth register robot_1 request.json")(register)
-    app.command(name="reader", epilog="Example: rosbridge-eth reader analyst --to analyst")(add_reader)
-    app.command(epilog="Example: rosbridge-eth revoke robot_1")(revoke)
-    app.command()(renew)
-    app.command()(mnemonic)
-    app.command(epilog="Example: rosbridge-eth handover 0x5aAe…; rosbridge-eth handover --home new")(handover)
-    app.command(epilog="Example: rosbridge-eth backup copy-of-operator")(backup)
-    app.command(epilog="Example: rosbridge-eth passwd --home robot")(passwd)
-    app.command(epilog="Example: rosbridge-eth server; rosbridge-eth server --shard 2")(server)
 
 
 def passphrase_of(home: OperatorHome, file: Path | None) -> bytes:
@@ -78,8 +62,6 @@ def _ca(home: OperatorHome, passphrase: bytes, file: Path | None) -> Certificate
 
 def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring]:
     """An operator's home, its passphrase and its accounts."""
-    from rosbridge_eth.ledger import Keyring
-
     place = OperatorHome(home).require()
     passphrase = passphrase_of(place, file)
     return place, passphrase, Keyring.load(place.accounts, passphrase)
@@ -87,8 +69,6 @@ def _opened(home: Path, file: Path | None) -> tuple[OperatorHome, bytes, Keyring
 
 def _inbox(place: OperatorHome, robot: str) -> Store:
     """The store of the shard to which this robot belongs."""
-    from rosbridge_eth.server.shard import open_store
-
     config = load_server_config(place.config)
     return open_store(config, place, shard_of(robot_id(robot), config.shards))
 
@@ -96,8 +76,6 @@ def _inbox(place: OperatorHome, robot: str) -> Store:
 @contextmanager
 def ledger_of(home: OperatorHome, *, check: bool = True) -> Iterator[Ledger]:
     """The contract on the configured node; ChainError unless it is there, which is not asked without `check`."""
-    from rosbridge_eth.ledger import Ledger
-
     with closing(Ledger.connect(load_server_config(home.config).chain.url, home.deployment())) as ledger:
         if check:
             ledger.check()
@@ -118,14 +96,13 @@ def up(
     What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
     """
     from rosbridge_eth.ledger.nodes import Anvil, free_port, is_free
-    from rosbridge_eth.operator.enrolment import deploy_contract, init_home
 
     log_to_stderr(log_format, verbose)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     if not (home / "home.json").exists():
         secret = read_passphrase("operator", "A passphrase for all of it", file=passphrase_file, confirm=True)
-        keys = init_home(
+        keys = enrolment.init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
             listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
             passphrase_file=passphrase_file,
@@ -159,7 +136,7 @@ def up(
         if not deployed:
             for shard in range(settings.shards):  # a port that is taken is told before a contract is paid for
                 server_socket(settings.listen.next(shard)).close()
-            made = deploy_contract(place, url, keys)
+            made = enrolment.deploy_contract(place, url, keys)
             if anvil is not None:
                 anvil.keeps(made.contract)  # a kill costs some seconds of the chain; without its contract, all of it
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
@@ -186,14 +163,11 @@ def init(
 
     In the operator's are the CA, the server's identity, and the seed of all accounts.
     """
-    from rosbridge_eth.ledger import Keyring
-    from rosbridge_eth.operator.enrolment import init_home
-
     place = OperatorHome(home)
     passphrase = read_passphrase("operator", "Operator passphrase", file=passphrase_file, confirm=True)
     readers = read_passphrase("reader", "Passphrase of the reader `owner`", file=reader_passphrase_file, confirm=True)
     words = mnemonic_file and read_passphrase("mnemonic", "Mnemonic", file=mnemonic_file).decode()
-    keys = init_home(
+    keys = enrolment.init_home(
         place, passphrase, reader=ReaderHome(reader), reader_passphrase=readers, now=utc_now(), listen=listen,
         public=public, chain_url=chain, ca=ca,
         ca_passphrase=read_passphrase("ca", "Passphrase of the CA", file=ca_passphrase_file)
@@ -236,10 +210,8 @@ def deploy(
     passphrase_file: PassphraseFile = None,
 ) -> None:
     """Create the contract on the configured chain."""
-    from rosbridge_eth.operator.enrolment import deploy_contract
-
     place, _, keys = _opened(home, passphrase_file)
-    made = deploy_contract(place, load_server_config(place.config).chain.url, keys, wait=wait)
+    made = enrolment.deploy_contract(place, load_server_config(place.config).chain.url, keys, wait=wait)
     talk(f"The contract is {made.contract} on chain {made.chain_id}.")
     talk("Next: `join --name NAME` on a robot, then here `register NAME REQUEST`.")
 
@@ -255,15 +227,13 @@ def register(
 
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
     """
-    from rosbridge_eth.operator.enrolment import register_robot
-
     asked = None if request is None else Request.decode(terminal.read_given(request))
     place, passphrase, keys = _opened(home, passphrase_file)
     prompt = f"Registration password of {name}"
     secret = None if asked else read_passphrase("robot", prompt, file=password_file, confirm=True)
     ca = _ca(place, passphrase, ca_passphrase_file)
     with ledger_of(place) as ledger:
-        made = register_robot(
+        made = enrolment.register_robot(
             place, name, ca=ca, keys=keys, ledger=ledger, inbox=lambda: _inbox(place, name), now=utc_now(),
             request=asked, password=secret, replace=replace, compromised=compromised,
         )  # fmt: skip
@@ -295,12 +265,10 @@ def add_reader(
     ca_passphrase_file: _CaPassphraseFile = None, reader_passphrase_file: _ReaderPassphraseFile = None,
 ) -> None:  # fmt: skip
     """Make another reader. Robots that are registered from now on seal for it too."""
-    from rosbridge_eth.operator import enrolment as administration
-
     place, folder = OperatorHome(home).require(), ReaderHome(to or Path(name))
     ca = _ca(place, passphrase_of(place, passphrase_file), ca_passphrase_file)
     secret = read_passphrase("reader", f"Passphrase of reader {name}", file=reader_passphrase_file, confirm=True)
-    administration.add_reader(place, name, folder, ca=ca, passphrase=secret, now=utc_now(), replace=replace)
+    enrolment.add_reader(place, name, folder, ca=ca, passphrase=secret, now=utc_now(), replace=replace)
     talk(f"{folder.path} is the home of reader {name}; carry it there. Its reader.toml names the node to ask.")
     talk(f"A robot registered before seals for it too once {folder.public} is in the robot's readers folder.")
     if replace:
@@ -314,11 +282,9 @@ def revoke(
     compromised: _CompromisedOption = False, passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
     """Revoke a name. The server closes its session at once, and the chain takes nothing from it any more."""
-    from rosbridge_eth.operator import enrolment as administration
-
     place, _, keys = _opened(home, passphrase_file)
     with ledger_of(place, check=False) as ledger:  # the server is told even where the node is away
-        ended = administration.revoke(
+        ended = enrolment.revoke(
             place, role, name, keys=keys, ledger=ledger, now=utc_now(), compromised=compromised,
             inbox=lambda: _inbox(place, name),
         )  # fmt: skip
@@ -332,12 +298,10 @@ def renew(
     ca_passphrase_file: _CaPassphraseFile = None,
 ) -> None:  # fmt: skip
     """Give the server new keys, before the certificates expire. Then start the server again."""
-    from rosbridge_eth.operator.enrolment import renew_server
-
     place = OperatorHome(home).require()
     passphrase = passphrase_of(place, passphrase_file)
     ca = _ca(place, passphrase, ca_passphrase_file)
-    old = renew_server(place, ca=ca, passphrase=passphrase, now=utc_now())
+    old = enrolment.renew_server(place, ca=ca, passphrase=passphrase, now=utc_now())
     talk(f"The server has new keys; those before are in {old}. Start the server again; robots need nothing.")
 
 
@@ -372,9 +336,7 @@ def backup(
     target: Annotated[Path, typer.Argument(help="A new folder.")], home: terminal.AnyHomeOption = OPERATOR_HOME
 ) -> None:
     """Copy a home, in use or not, into a new folder. Keep it where its keys are safe."""
-    from rosbridge_eth.operator import enrolment as administration
-
-    administration.backup(home, target)
+    enrolment.backup(home, target)
     talk(f"{target} is a copy of {home}.")
 
 
@@ -383,11 +345,9 @@ def passwd(
     new_passphrase_file: Annotated[Path | None, typer.Option(help="The new one, on the first line.")] = None,
 ) -> None:  # fmt: skip
     """Put the keys of a home under another passphrase."""
-    from rosbridge_eth.operator.enrolment import change_passphrase
-
     old = read_passphrase("present", "Present passphrase", file=passphrase_file)
     new = read_passphrase("new", "New passphrase", file=new_passphrase_file, confirm=True)
-    files = change_passphrase(home, old, new)
+    files = enrolment.change_passphrase(home, old, new)
     talk(f"{len(files)} files of {home} are under the new passphrase.")
 
 
@@ -408,11 +368,7 @@ def _serve(
     look: Callable[[], None] = lambda: None,
 ) -> None:  # fmt: skip
     """Run the server, or these shards of it; what `look` raises ends it in good order."""
-    from rosbridge_eth.operator.enrolment import load_server_identity
-    from rosbridge_eth.server.parent import Parent
-    from rosbridge_eth.server.shard import Secrets
-
-    secrets = Secrets(load_server_identity(place, passphrase), keys)
+    secrets = Secrets(enrolment.load_server_identity(place, passphrase), keys)
 
     def ready(addresses: list[Address]) -> None:
         talk(f"Listening on UDP {', '.join(map(str, addresses))}; Ctrl-C ends it.")

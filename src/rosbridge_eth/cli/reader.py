@@ -25,24 +25,15 @@ from rosbridge_eth.config.values import Address, counted, parse_address, parse_t
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, VerificationError
 from rosbridge_eth.files import write_atomically
 from rosbridge_eth.identity import Role, Trust, load_identity, public_identity, read_certificates
-from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading, Verdict, read_robot
+from rosbridge_eth.ledger import Ledger
+from rosbridge_eth.reading import Bookmarks, Choice, ProvenRecord, Reading, Verdict, outputs, read_robot
+from rosbridge_eth.reading import compare as comparing
+from rosbridge_eth.reading import evidence as proofs
+from rosbridge_eth.reading import grant as granting
+from rosbridge_eth.reading.follow import EVERY, Followed, Following
+from rosbridge_eth.reading.live import OWN_NAMES, Page, View
 from rosbridge_eth.reading.verdict import shown
 from rosbridge_eth.terminal import READER_HOME, Json, PassphraseFile, ReaderHomeOption, print_json, read_given, talk
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command(
-        epilog="Examples: rosbridge-eth read robot_1 --topic /robot_1/odom > records.jsonl;"
-        " rosbridge-eth read robot_1 robot_2 --follow --serve 8080"
-    )(read)
-    app.command(epilog="Example: rosbridge-eth compare my.bag robot_1 --topic /robot_1/odom")(compare)
-    app.command(
-        epilog="Example: rosbridge-eth grant robot_1 --from 2026-11-21T10:00:00Z --to 2026-11-21T10:05:00Z"
-        " --reader insurer.pem"
-    )(grant)
-    app.command(epilog="Example: rosbridge-eth evidence robot_1 crash.html --at 2026-11-21T10:00:00Z")(evidence)
-    app.command(epilog="Example: rosbridge-eth verify crash.html --ca ca.crt.pem")(verify)
-
 
 DAY_NS = 86_400 * 10**9
 
@@ -107,8 +98,6 @@ def read(
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
     sealed for others. With --follow, an .mcap file grows; others are there at the end.
     """
-    from rosbridge_eth.reading import outputs
-
     choice, robot = _choice_of(topic, from_, to, at), [*dict.fromkeys(robot)]
     if field and plot is None:
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
@@ -180,8 +169,6 @@ def compare(
 
     Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
     """
-    from rosbridge_eth.reading import compare as comparing
-
     with (
         closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
         reader.reading(robot) as (reading, said),
@@ -213,8 +200,6 @@ def evidence(
 
     Exits with 9, like read, where the log that they are from is not sound; the file is written nevertheless.
     """
-    from rosbridge_eth.reading import evidence as making
-
     choice = _choice_of(topic, from_, to, at)
     if choice == _choice_of(None, None, None, None):
         raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
@@ -224,13 +209,13 @@ def evidence(
         closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
         reader.reading(robot) as (reading, said),
     ):
-        records = list(islice(reading.records(choice), making.MAX_CHOSEN + 1))
+        records = list(islice(reading.records(choice), proofs.MAX_CHOSEN + 1))
         for _ in reading.proven:
             continue  # the verdict is on all of the log
         if not records:
             _tell_topics(topic, reading)
             raise ConfigError("no record was chosen; nothing is written")
-        made = making.make(reading, records)
+        made = proofs.make(reading, records)
     write_atomically(file, (made.page() if file.suffix == ".html" else made.encode() + "\n").encode(), new=True)
     what = counted(len(made.records), "record")
     talk(f"{file}: {what}, for `verify {file} --ca ca.crt.pem`; who has it can read what it shows")
@@ -247,14 +232,11 @@ def verify(
 
     Exits with 9 where anything does not hold, with 7 where the node named does not answer.
     """
-    from rosbridge_eth.reading import evidence as checking
-    from rosbridge_eth.reading import outputs
-
-    data = read_given(file, checking.MAX_FILE + 1)
-    given = checking.Evidence.read(data)
+    data = read_given(file, proofs.MAX_FILE + 1)
+    given = proofs.Evidence.read(data)
     roots = read_certificates(read_given(ca))
-    found = checking.verify(given, roots, lambda line: talk(f"holds: {line}"))
-    asked = None if node is None else checking.ask(given, found, roots, node)
+    found = proofs.verify(given, roots, lambda line: talk(f"holds: {line}"))
+    asked = None if node is None else proofs.ask(given, found, roots, node)
     if asked is not None:
         talk(f"holds: the contract has {counted(len(given.chunks), 'chunk')} as the file says, says {asked.node}")
     if json:
@@ -286,8 +268,6 @@ def grant(
 
     They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
     """
-    from rosbridge_eth.reading import grant as granting
-
     choice, known = _choice_of(None, from_, to, None), ReaderHome(home).require().path / "readers" / f"{reader}.pem"
     peer = public_identity(read_given(known if known.exists() else Path(reader)))
     now = datetime.now(UTC)
@@ -319,16 +299,15 @@ class _Reader:
     def __init__(
         self, home: Path, nodes: Sequence[str] | None, confirmations: int, confirm: bool, passphrase_file: Path | None
     ) -> None:
-        from rosbridge_eth.ledger import Ledger
-        from rosbridge_eth.reading.grant import open_folder
-
         self.home = ReaderHome(home).require()
         config = load_reader_config(self.home.config)
         passphrase = read_passphrase("reader", "Passphrase of the reader", file=passphrase_file)
         self.identity, roots = load_identity(self.home.path, passphrase)
         self.trust, self.confirmations, self.confirm = Trust(roots), confirmations, confirm
         self.bookmarks = Bookmarks(self.home.path / "bookmarks.json")
-        self._granted = open_folder(self.home.grants, ledger=config.ledger, reader=self.identity, trust=self.trust)
+        self._granted = granting.open_folder(
+            self.home.grants, ledger=config.ledger, reader=self.identity, trust=self.trust
+        )
         self.ledgers = [Ledger.connect(url, config) for url in nodes or config.chain]
 
     def close(self) -> None:
@@ -379,9 +358,6 @@ def _following(
 
     turns: called whenever all was given that there is.
     """
-    from rosbridge_eth.reading.follow import EVERY, Followed, Following
-    from rosbridge_eth.reading.live import OWN_NAMES, Page, View
-
     said, stop = dict[str, dict[str, Any]](), threading.Event()
     followed = [Followed(name, reader.begin, reader.bookmarks, confirm=reader.confirm) for name in robots]
     following = Following(followed, reader.ledgers)

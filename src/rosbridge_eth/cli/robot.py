@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Group, RenderableType
@@ -29,23 +29,16 @@ from rosbridge_eth.identity import check_name
 from rosbridge_eth.log.chunk import STREAM_SIZE
 from rosbridge_eth.operator import bundle as bundles
 from rosbridge_eth.reading.verdict import grouped
+from rosbridge_eth.robot.loop import Robot, open_robot, read_again
 from rosbridge_eth.robot.sources import Offer, Selection
 from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
+from rosbridge_eth.server import metrics
+from rosbridge_eth.server.parent import notify
 from rosbridge_eth.terminal import LogFormat, errors, live, log_to_stderr, one_line, plain, table, talk
-
-if TYPE_CHECKING:
-    from rosbridge_eth.robot.loop import Robot
-    from rosbridge_eth.server.metrics import Rates
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
 TAKEN_WITHIN = 10.0  # seconds for a running robot to see what `trigger` asks for; it looks once a second
-
-
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth join --name robot_1 --source ros1 --topic /odom")(join)
-    app.command(epilog="Example: rosbridge-eth robot --home robot --verbose")(robot)
-    app.command(epilog="Example: rosbridge-eth trigger crash")(trigger)
 
 
 def join(
@@ -151,10 +144,6 @@ def robot(
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
-    from rosbridge_eth.robot.loop import open_robot, read_again
-    from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.parent import notify
-
     log_to_stderr(log_format, verbose)
     place = RobotHome(home)
     if joined := bundles.join_with_answer(place):
@@ -204,7 +193,7 @@ def robot(
                         told = True
                         before = " or before" if any(newest[STREAM_SIZE:]) else ""
                         talk(f"The first record is in block {block}{before}.")
-                    metrics.show_robot(end.robot, running, time.time())
+                    metrics.show(metrics.of_robot(end.robot, running, time.time()))
                     metrics.save(metrics.file_of(home, "robot"))
                 show()
 
@@ -219,8 +208,6 @@ def trigger(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
 ) -> None:
     """Have the robot write what it keeps in memory for an event. It runs with this home; the event is now."""
-    from rosbridge_eth.server import metrics
-
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
     if (figures := metrics.running(home).get("robot")) is None:
@@ -248,7 +235,7 @@ def _asked_for(place: RobotHome, triggers: Iterable[str]) -> list[str]:
     return asked
 
 
-def _picture(name: str, running: Robot, rates: Rates) -> RenderableType:
+def _picture(name: str, running: Robot, rates: metrics.Rates) -> RenderableType:
     """What a person at the terminal sees: topics, chunks, session."""
     now, lost = time.monotonic(), Counter[str]()
     for (topic, _), count in running.lost.items():

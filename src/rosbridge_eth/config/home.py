@@ -2,7 +2,7 @@
 
 Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none: its
 `.unfinished` is left, and who makes a home there begins anew. While a shard of the server or a robot runs,
-`.shard-0.prom` or `.robot.prom` is what it counts (metrics).
+`.shard-0.json` or `.robot.json` is what it counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
+from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.log.store import Store
 
 
@@ -19,6 +21,8 @@ def open_store(
         from rosbridge_eth.log.sqlite import SqliteStore
 
         return SqliteStore(file, ledger, max_bytes, max_bytes_per_robot, read_only=read_only)
+    if not find_spec("redis"):
+        raise ConfigError("a store in a Redis needs redis: pip install 'pysmcrypto[redis]'")
     from rosbridge_eth.log.redis import RedisStore
 
     return RedisStore(url, ledger, max_bytes, max_bytes_per_robot)

@@ -84,6 +84,14 @@ class LogWriter:
         self._waiting.append((now, line, definition, topic))
         self._bytes += len(line)
 
+    def wrote(self, sealed: Chunk) -> bool:
+        """Whether the signature is of this log's key, and the body the chunk's own."""
+        try:
+            chunk.verify(self._log, self._key.public_key, sealed)
+        except chunk.ChunkError:
+            return False
+        return True
+
     def next_timer(self) -> float:
         """When `closed` has something to give; in the past if it has now."""
         if self._number and not self._waiting:

@@ -378,10 +378,6 @@ CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
 _SIGN = {"ok": "ok", "note": "NOTE", "broken": "BROKEN", "skipped": "not tried"}
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth doctor --home robot --passphrase-file password")(doctor)
-
-
 def doctor(
     home: AnyHomeOption = OPERATOR_HOME,
     passphrase: Annotated[Path | None, typer.Option(

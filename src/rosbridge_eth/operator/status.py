@@ -370,10 +370,6 @@ def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
     return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth status robot_1; rosbridge-eth status --home robot")(status)
-
-
 def status(
     robot: Annotated[str | None, typer.Argument(help="This one alone, and how far its log is on the chain.")] = None,
     home: AnyHomeOption = OPERATOR_HOME,

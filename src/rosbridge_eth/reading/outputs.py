@@ -333,6 +333,8 @@ class Bag:
 
 def check_picture(path: Path) -> None:
     """ConfigError unless a picture can be drawn there."""
+    if not find_spec("matplotlib"):
+        raise ConfigError(f"{path}: a picture needs matplotlib: pip install 'pysmcrypto[plot]'")
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise ConfigError(f"{path}: a picture is a .png, .svg or .pdf file")
     if not path.parent.is_dir():

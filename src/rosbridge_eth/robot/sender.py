@@ -2,7 +2,8 @@
 
 The server's last word (log/hop.py) says how far it has the log, and that is all that is remembered of it: what follows
 is sent as long as the session takes it, again from the head where the server did not take it, and nothing while it
-says why not. A chunk that it will never take is set aside. What is confirmed on the chain leaves the disk.
+says why not. A chunk that it refuses is set aside if it is wrong here, too; what is confirmed on the chain leaves the
+disk.
 
 The log forked where the server's head is no chunk of this robot's and what follows here does not follow it: another
 machine has this robot's identity, or the disk was put back from an old copy. Then nothing is sent or removed, and it
@@ -25,7 +26,7 @@ from rosbridge_eth.channel import (
     State,
     Unresolved,
 )  # fmt: skip
-from rosbridge_eth.log.chunk import MAX_TIME_MS, STREAM_SIZE, Chunk
+from rosbridge_eth.log.chunk import MAX_TIME_MS, STREAM_SIZE, Chunk, Malformed
 from rosbridge_eth.log.hop import ELSEWHERE, FORKED, HopError, ServerState, encode_offer
 from rosbridge_eth.log.store import NO_DIGEST, NOWHERE
 from rosbridge_eth.log.writer import LogWriter
@@ -38,6 +39,10 @@ SAY_AGAIN = 60.0  # seconds before the same reason why nothing is sent is said o
 TWICE = (
     "another session took the place of this one: another machine has this robot's identity; `revoke` it,"
     " `register --replace` it, and `join` the new bundle in a new folder, on one machine"
+)
+REFUSED_RIGHT = (
+    "the server refuses a chunk whose signature and body are right: it is the server of another contract, or has a"
+    " defect; ask the operator, whose log says more"
 )
 
 
@@ -173,14 +178,21 @@ class Sender:
         self.held = state.why
         if state.why:
             return
+        if self._spool.place(state.refused):
+            self.held = REFUSED_RIGHT
+            self._warn(REFUSED_RIGHT, REFUSED_RIGHT, now)
+            return
         if self._writer.stream and state.head[:STREAM_SIZE] > self._writer.stream:
             self._fork(self._spool.newest, now)  # what this process wrote stands below what somebody else did
             return
         while self._sent < self._spool.newest and (rows := self._spool.rows(self._sent, AT_ONCE)):
             for row in rows:
                 [encoded] = self._spool.chunks([row.place])
-                previous = Chunk.parse(encoded).header.previous
-                if previous != self._digest and self._spool.has(previous):
+                if (chunk := _parsed(encoded)) is None or chunk.header.digest != row.digest:
+                    self._set_aside(row.digest)
+                    continue
+                previous = chunk.header.previous
+                if previous != self._digest and self._spool.place(previous):
                     self._fork(row.place, now)
                     return
                 if not self._put(encoded, b"" if previous == self._digest else self._digest):
@@ -194,10 +206,17 @@ class Sender:
             self.confirmed += self._spool.confirmed(state.confirmed)
         if ours or state.head < self._spool.covered:
             self._spool.stored(state.head)
-        if state.refused != NO_DIGEST and (place := self._spool.set_aside(state.refused)):
+        if place := self._spool.place(state.refused):
+            chunk = _parsed(*self._spool.chunks([place]))
+            if chunk is None or not self._writer.wrote(chunk):
+                self._set_aside(state.refused)
+
+    def _set_aside(self, digest: bytes) -> None:
+        """The chunk with this header is not what was sealed, or not by this robot's key."""
+        if place := self._spool.set_aside(digest):
             self.refused += 1
             log.error(
-                "the server refuses chunk %d of stream %s, since its signature or its body is wrong; it is set aside"
+                "chunk %d of stream %s is not sent, since its signature or its body is wrong; it is set aside"
                 " and a new stream begins", int.from_bytes(place[STREAM_SIZE:], "big"), place[:STREAM_SIZE].hex(),
             )  # fmt: skip
             if place[:STREAM_SIZE] == self._writer.stream:
@@ -227,3 +246,11 @@ class Sender:
         self._client.send(offer)
         self.sent += 1
         return True
+
+
+def _parsed(encoded: bytes) -> Chunk | None:
+    """None where the disk has changed it so that it is none any more."""
+    try:
+        return Chunk.parse(encoded)
+    except Malformed:
+        return None

@@ -94,9 +94,9 @@ class Spool:
         """The encoded chunks at these places."""
         return self._store.chunks(self._tk, places)
 
-    def has(self, digest: bytes) -> bool:
-        """Whether the chunk with this header is here, and not set aside."""
-        return self._store.has(self._tk, digest)
+    def place(self, digest: bytes) -> bytes | None:
+        """The place of the chunk with this header, None if it is not here, or set aside."""
+        return self._store.place(self._tk, digest)
 
     def statistics(self) -> SpoolStatistics:
         """What is in the spool at this moment."""
@@ -125,11 +125,10 @@ class Spool:
         return count
 
     def set_aside(self, digest: bytes) -> bytes | None:
-        """The server will never take the chunk with this header: it is not sent again. Its place, None if it is not
-        here."""
-        place = self._store.place(self._tk, digest)
+        """The chunk with this header is wrong: it is not sent again. Its place, None if it is not here."""
+        place = self.place(digest)
         if place is not None:
-            self._store.remove(self._tk, [place], "the server refuses it")
+            self._store.remove(self._tk, [place], "it is wrong")
             self._aside = self._held_aside()
             self._bare_to, self._bare = NOWHERE, 0
         return place
@@ -162,7 +161,7 @@ class Spool:
             self._bare_to, self._bare, self._aside, self._dropped_bodies = before
             self._shrink(min(self._max_bytes - size, self._bytes() - spare))
             [outcome] = self._store.append([offer], chunk.header.sealed_ms / 1000)
-            if outcome is not Outcome.STORED and not self.has(chunk.header.digest):
+            if outcome is not Outcome.STORED and self.place(chunk.header.digest) is None:
                 raise StoreError(f"the spool {self._path} holds what is newer than {chunk.header}; move it away")
 
         try:

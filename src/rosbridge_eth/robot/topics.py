@@ -174,10 +174,6 @@ def _sealed(lines: list[tuple[float, bytes]], config: RobotConfig, kind: str, re
     return chunks + writer.finish(0)
 
 
-def add_commands(app: typer.Typer) -> None:
-    app.command(epilog="Example: rosbridge-eth topics --source drive.bag")(topics)
-
-
 SourceOption = Annotated[
     str | None, typer.Option(help="ros1, ros2, sim, a ROS 1 master's URI or a bag; else what the environment says.")
 ]

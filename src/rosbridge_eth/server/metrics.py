@@ -1,30 +1,27 @@
-"""What the processes count, as Prometheus has it: served at /metrics, and saved where `status` finds it.
+"""What the processes count: served at /metrics, and saved in the home, where `status` finds it.
 
-A shard of the server, and a robot, has its figures in its own memory; prometheus_client serves them on the port that
-`monitor` names. Every two seconds it saves them in a file of its home, too (`.shard-0.prom`, `.robot.prom`), which it
-removes at its end: a file that was not touched for SILENCE is of a process that was killed, or hangs. The table of
-docs/operations.md has all figures.
+A shard of the server, or a robot, keeps its figures in memory. Every two seconds it saves them in a file of its home
+(`.shard-0.json`, `.robot.json`), which it removes when it ends: a file older than SILENCE belongs to a process that was
+killed or hangs. With `monitor`, prometheus_client serves them, too. docs/operations.md says what each figure is.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
-
-from prometheus_client import CollectorRegistry, Gauge, start_http_server, write_to_textfile
-from prometheus_client.parser import text_string_to_metric_families
+from typing import TYPE_CHECKING, Any, Final
 
 from rosbridge_eth.channel import Drop
 from rosbridge_eth.config.values import Address
-from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.errors import ConfigError, NetworkError
 from rosbridge_eth.ledger.contract import WEI_PER_ETH
-from rosbridge_eth.log.store import Store
 
 if TYPE_CHECKING:
     from rosbridge_eth.operator.registry import Enrolment
@@ -36,72 +33,54 @@ EVERY: Final = 2.0  # seconds between two looks at what a process counted
 SILENCE: Final = 15.0  # seconds without a beat after which a process counts as hanging
 LITTLE_ROOM: Final = 64 << 20  # bytes; below this the disk counts as full
 
-REGISTRY = CollectorRegistry()
-_PREFIX: Final = "rosbridge_eth_"
 Figure = tuple[str, dict[str, str], float]
+"""Name, labels and value."""
+FIGURES: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {}
 
 
-def _gauge(name: str, help: str, *labels: str) -> Gauge:
-    # Without a label it would stand at 0 in every process that has nothing to say of it.
-    return Gauge(_PREFIX + name, help, labels, registry=REGISTRY)
+def show(figures: Iterable[Figure]) -> None:
+    """Set these figures; all others of this process stay as they are."""
+    for name, labels, value in figures:
+        FIGURES[name, (*labels.items(),)] = float(value)
 
 
-BEAT = _gauge("beat_seconds", "When the process last took a turn, seconds since 1970.", "process")
-STARTS = _gauge("starts", "How often the shard was started since the server was.", "process")
-CONDITION = _gauge("condition", "1 while the condition holds.", "process", "name")
-CHANNEL = _gauge("channel", "Counts of the channel since the process began, by what was counted.", "process", "count")
-DROPPED = _gauge("datagrams_dropped", "Datagrams dropped without an answer, by reason.", "process", "reason")
-
-CHUNKS = _gauge("chunks", "Chunks that arrived since the process began, by what became of them.", "process", "outcome")
-STORED = _gauge("records_stored", "Lines of the log stored since the process began.", "process", "robot")
-RATE = _gauge("records_per_second", "Lines stored a second, over the last ten.", "process", "robot")
-NEWEST = _gauge(
-    "newest_chunk_seconds", "When its newest chunk was sealed, seconds since 1970 by its clock.", "process", "robot"
-)
-SESSION = _gauge("session_seen_seconds", "When its session was last seen, seconds since 1970.", "robot", "address")
-FORKED = _gauge(
-    "forked_seconds",
-    "When its log was last seen to go on in two places, or two machines to have its identity, seconds since 1970.",
-    "robot",
-)
-WAITING = _gauge("waiting_chunks", "Chunks in the store that are not confirmed on the chain.", "robot")
-WAITING_BYTES = _gauge("waiting_bytes", "Their bytes.", "robot")
-OLDEST = _gauge("waiting_seconds", "Age of the oldest of them.", "robot")
-HELD = _gauge("on_hold", "1 while nothing is written for the robot; `status` says why.", "robot")
-ON_CHAIN = _gauge("chain_chunks", "Its chunks on the chain.", "robot")
-BLOCK = _gauge("chain_block", "The block that has the newest of them.", "robot")
-GAS = _gauge("gas", "Gas of the transactions sent for it since the submitter began.", "robot")
-SUBMITTER = _gauge("submitter", "Counts of the submitter since it began, by what was counted.", "process", "count")
-BALANCE = _gauge("treasury_eth", "Balance of the operator's account, at shard 0.", "process")
-HEAD = _gauge("head_block", "Number of the node's latest block.", "process")
-HEAD_AGE = _gauge("head_age_seconds", "Age of that block by its own timestamp.", "process")
-DISK_FREE = _gauge("disk_free_bytes", "Bytes free where the home is.", "process")
-
-CAPTURED = _gauge("captured", "Records captured since the robot was started.", "robot")
-LOST = _gauge("lost", "Messages not captured, by topic and why; the log says so, too.", "robot", "topic", "why")
-FIRED = _gauge("trigger_fired", "Events since the robot was started.", "robot", "trigger")
-KEPT = _gauge("trigger_records", "Records in memory for the next event.", "robot", "trigger")
-KEPT_BYTES = _gauge("trigger_bytes", "Bytes that these count, of the trigger's `memory`.", "robot", "trigger")
-SPOOL_CHUNKS = _gauge("spool_chunks", "Chunks in the spool: all, not stored there, set aside.", "robot", "state")
-SPOOL_BYTES = _gauge("spool_bytes", "Bytes in the spool.", "robot")
-SPOOL_DROPPED = _gauge("spool_dropped", "Bodies of chunks that a full spool gave up since the start.", "robot")
-CONNECTED = _gauge("connected", "1 while a session with the server stands.", "robot")
+def figures() -> list[Figure]:
+    """All that this process shows."""
+    shown = list(FIGURES.items())  # at once: the submitter's thread adds to them
+    return [(name, dict(labels), value) for (name, labels), value in shown]
 
 
 # Where others see them
 
 
+class _Collector:
+    """What prometheus_client asks for the figures."""
+
+    def collect(self) -> Iterable[Any]:
+        from prometheus_client.metrics_core import GaugeMetricFamily
+
+        families: dict[str, GaugeMetricFamily] = {}
+        for name, labels, value in figures():
+            new = GaugeMetricFamily(f"rosbridge_eth_{name}", "See docs/operations.md.", labels=[*labels])
+            families.setdefault(name, new).add_metric([*labels.values()], value)
+        return families.values()
+
+
 @contextmanager
 def served(address: Address | None) -> Iterator[None]:
-    """Inside, /metrics answers at this address (None: nowhere). NetworkError if the port cannot be had.
+    """Inside, /metrics answers at this address (None: nowhere). Raises NetworkError if the port cannot be opened.
 
-    Meant for the machine itself or a private network: whoever reaches the port reads names, balances and counts.
+    For the machine itself or a private network: whoever reaches the port reads names, balances and counts.
     """
     if address is None:
         yield
         return
     require_free(address)
-    http, _ = start_http_server(address.port, address.host, REGISTRY)
+    from prometheus_client import CollectorRegistry, start_http_server
+
+    registry = CollectorRegistry()
+    registry.register(_Collector())
+    http, _ = start_http_server(address.port, address.host, registry)
     try:
         yield
     finally:
@@ -110,45 +89,46 @@ def served(address: Address | None) -> Iterator[None]:
 
 
 def require_free(address: Address | None) -> None:
-    """NetworkError if the port of /metrics cannot be had."""
+    """Raises ConfigError without the package that serves /metrics, NetworkError if the port cannot be opened."""
+    if address is None:
+        return
+    if not find_spec("prometheus_client"):
+        raise ConfigError("`monitor` needs prometheus-client: pip install 'pysmcrypto[metrics]'")
     try:
-        if address is not None:
-            socket.create_server(address, family=address.family).close()
+        socket.create_server(address, family=address.family).close()
     except OSError as error:
         raise NetworkError(f"TCP {address} cannot be opened: {error.strerror}; correct `monitor`") from error
 
 
 def file_of(home: Path, process: str) -> Path:
-    return home / f".{process}.prom"
+    return home / f".{process}.json"
 
 
 def save(file: Path) -> None:
     """For `status`. Where the disk is full, it shows at least that the process is there."""
+    new = file.with_suffix(".new")
     try:
-        write_to_textfile(str(file), REGISTRY)
+        new.write_text(json.dumps(figures()))
+        new.replace(file)  # not synchronised: after a power cut nobody needs it
     except OSError:
         with suppress(OSError):
+            new.unlink(missing_ok=True)
             file.touch()
 
 
-def parsed(text: str) -> list[Figure]:
-    """Name (without its prefix), labels and value of what /metrics shows."""
-    return [(sample.name.removeprefix(_PREFIX), sample.labels, sample.value)
-            for family in text_string_to_metric_families(text) for sample in family.samples]  # fmt: skip
-
-
 def running(home: Path) -> dict[str, list[Figure] | None]:
-    """The figures of every process of this home; None of one that was killed, or hangs."""
+    """The figures of every process of this home; None for one that was killed or hangs."""
     found: dict[str, list[Figure] | None] = {}
-    for file in sorted(home.glob(".*.prom")):
+    for file in sorted(home.glob(".*.json")):
         with suppress(OSError):  # it ends at this moment
             alive = time.time() - file.stat().st_mtime <= SILENCE
-            found[file.stem.removeprefix(".")] = parsed(file.read_text()) if alive else None
+            content = file.read_text() or "[]"  # empty: there was never room on the disk
+            found[file.stem.removeprefix(".")] = [(*figure,) for figure in json.loads(content)] if alive else None
     return found
 
 
-def failing(figures: list[Figure]) -> list[str]:
-    """Of what a process shows, its parts that hang and the conditions that do not hold."""
+def failing(figures: Iterable[Figure]) -> list[str]:
+    """Of what a process shows: its parts that hang, and the conditions that do not hold."""
     beats = {labels["process"]: value for name, labels, value in figures if name == "beat_seconds"}
     return [
         *(f"{part} works" for part, beat in beats.items() if max(beats.values()) - beat > SILENCE),
@@ -172,13 +152,13 @@ class Beats:
 
 
 class Rates:
-    """What a count grows by a second, over the last ten looks, by a name."""
+    """How much a count grows in a second, over the last ten looks, by a name."""
 
     def __init__(self) -> None:
         self._seen: dict[str, deque[tuple[float, float]]] = {}
 
     def of(self, name: str, count: float, now: float) -> float:
-        """Take a count in; the rate since the oldest look that is kept."""
+        """Add a count; the rate since the oldest look that is kept."""
         seen = self._seen.setdefault(name, deque(maxlen=11))
         seen.append((now, count))
         return (count - seen[0][1]) / (now - seen[0][0]) if now > seen[0][0] else 0.0
@@ -187,89 +167,90 @@ class Rates:
 _STORED_RATES = Rates()
 
 
-# What each process shows of itself
+# What each process shows
 
 
-def show_channel(process: str, counted: Mapping[str, int], lost_sends: int) -> None:
+def _channel(process: str, counted: Mapping[str, int], lost_sends: int) -> Iterator[Figure]:
     for what, count in counted.items():
-        (DROPPED if isinstance(what, Drop) else CHANNEL).labels(process, what).set(count)
-    CHANNEL.labels(process, "lost_sends").set(lost_sends)
+        if isinstance(what, Drop):
+            yield "datagrams_dropped", {"process": process, "reason": what}, count
+        else:
+            yield "channel", {"process": process, "count": what}, count
+    yield "channel", {"process": process, "count": "lost_sends"}, lost_sends
 
 
-def show_worker(process: str, worker: Worker, wall: float) -> None:
+def of_worker(process: str, worker: Worker, wall: float) -> Iterator[Figure]:
     """A shard's channel and sessions, and what became of the chunks that reached it."""
     reception = worker.reception
-    BEAT.labels(process).set(wall)
-    show_channel(process, reception.server.statistics(), worker.loop.lost_sends)
+    yield "beat_seconds", {"process": process}, wall
+    yield from _channel(process, reception.server.statistics(), worker.loop.lost_sends)
     for outcome, count in reception.counts.items():
-        CHUNKS.labels(process, outcome).set(count)
+        yield "chunks", {"process": process, "outcome": outcome}, count
     for robot, records in reception.records.items():
-        STORED.labels(process, robot).set(records)
-        RATE.labels(process, robot).set(_STORED_RATES.of(robot, records, wall))
-        NEWEST.labels(process, robot).set(reception.newest[robot])
+        yield "records_stored", {"process": process, "robot": robot}, records
+        yield "records_per_second", {"process": process, "robot": robot}, _STORED_RATES.of(robot, records, wall)
+        yield "newest_chunk_seconds", {"process": process, "robot": robot}, reception.newest[robot]
     for session in reception.sessions.values():
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time
-            SESSION.labels(session.peer.name, address[0]).set(wall)
+            yield "session_seen_seconds", {"robot": session.peer.name, "address": address[0]}, wall
     for robot, at in reception.forked.items():
-        FORKED.labels(robot).set(wall - time.monotonic() + at)
-    CONDITION.labels(process, "stores chunks").set(reception.trouble.why is None)
+        yield "forked_seconds", {"robot": robot}, wall - time.monotonic() + at
+    yield "condition", {"process": process, "name": "stores chunks"}, reception.trouble.why is None
 
 
-def show_submitter(
-    process: str, submitter: Submitter, store: Store, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
-) -> None:
+def of_submitter(
+    process: str, submitter: Submitter, robots: Mapping[bytes, Enrolment], folder: Path, wall: float
+) -> Iterator[Figure]:
     """What waits for the chain, and whether it gets there. Raises StoreError."""
-    BEAT.labels(f"{process} submitter").set(wall)
-    for (tk, robot), state in zip(robots.items(), store.states([*robots]), strict=True):
-        name, held = robot.name, store.waiting(tk)
-        WAITING.labels(name).set(held.chunks)
-        WAITING_BYTES.labels(name).set(held.bytes)
-        OLDEST.labels(name).set(0 if held.oldest is None else max(0.0, wall - held.oldest))
-        HELD.labels(name).set(bool(state.hold) and (held.chunks > 0 or robot.revoked_at is None))
-        GAS.labels(name).set(submitter.gas[tk])
+    yield "beat_seconds", {"process": f"{process} submitter"}, wall
+    for (tk, robot), state in zip(robots.items(), submitter.store.states([*robots]), strict=True):
+        name, held = {"robot": robot.name}, submitter.store.waiting(tk)
+        yield "waiting_chunks", name, held.chunks
+        yield "waiting_bytes", name, held.bytes
+        yield "waiting_seconds", name, 0 if held.oldest is None else max(0.0, wall - held.oldest)
+        yield "on_hold", name, bool(state.hold) and (held.chunks > 0 or robot.revoked_at is None)
+        yield "gas", name, submitter.gas[tk]
         if standing := submitter.standings.get(tk):
-            ON_CHAIN.labels(name).set(standing.chunks)
-            BLOCK.labels(name).set(standing.data_block)
+            yield "chain_chunks", name, standing.chunks
+            yield "chain_block", name, standing.data_block
     for what, count in submitter.counts.items():
-        SUBMITTER.labels(process, what).set(count)
+        yield "submitter", {"process": process, "count": what}, count
     if submitter.head is not None:
-        HEAD.labels(process).set(submitter.head.number)
-        HEAD_AGE.labels(process).set(max(0.0, wall - submitter.head.time))
+        yield "head_block", {"process": process}, submitter.head.number
+        yield "head_age_seconds", {"process": process}, max(0.0, wall - submitter.head.time)
     if submitter.operator_balance is not None:
-        BALANCE.labels(process).set(submitter.operator_balance / WEI_PER_ETH)
+        yield "treasury_eth", {"process": process}, submitter.operator_balance / WEI_PER_ETH
     room = shutil.disk_usage(folder).free
-    DISK_FREE.labels(process).set(room)
-    for condition, holds in {
-        "node answers": submitter.trouble is None, "chunks are confirmed": submitter.unconfirmed is None,
-        "treasury can pay": submitter.funds is None, "disk has room": room >= LITTLE_ROOM,
-    }.items():  # fmt: skip
-        CONDITION.labels(process, condition).set(holds)
+    yield "disk_free_bytes", {"process": process}, room
+    yield "condition", {"process": process, "name": "node answers"}, submitter.trouble is None
+    yield "condition", {"process": process, "name": "chunks are confirmed"}, submitter.unconfirmed is None
+    yield "condition", {"process": process, "name": "treasury can pay"}, submitter.funds is None
+    yield "condition", {"process": process, "name": "disk has room"}, room >= LITTLE_ROOM
 
 
-def show_robot(name: str, robot: Robot, wall: float) -> None:
+def of_robot(name: str, robot: Robot, wall: float) -> Iterator[Figure]:
     """A robot's capture, spool and session. Raises StoreError."""
-    BEAT.labels("robot").set(wall)
-    show_channel("robot", robot.client.statistics(), robot.loop.lost_sends)
-    CAPTURED.labels(name).set(robot.captured)
-    for gauge in (FIRED, KEPT, KEPT_BYTES):  # of triggers that a reload took away, too
-        gauge.clear()
+    for key in [key for key in FIGURES if key[0].startswith("trigger_")]:  # a reload may have removed it
+        del FIGURES[key]
+    yield "beat_seconds", {"process": "robot"}, wall
+    yield from _channel("robot", robot.client.statistics(), robot.loop.lost_sends)
+    yield "captured", {"robot": name}, robot.captured
     for trigger in robot.box.triggers.values():
-        FIRED.labels(name, trigger.rule.name).set(trigger.fired)
-        KEPT.labels(name, trigger.rule.name).set(len(trigger.ring))
-        KEPT_BYTES.labels(name, trigger.rule.name).set(trigger.ring.bytes)
+        yield "trigger_fired", {"robot": name, "trigger": trigger.rule.name}, trigger.fired
+        yield "trigger_records", {"robot": name, "trigger": trigger.rule.name}, len(trigger.ring)
+        yield "trigger_bytes", {"robot": name, "trigger": trigger.rule.name}, trigger.ring.bytes
     for (topic, why), count in robot.lost.items():
-        LOST.labels(name, topic, why).set(count)
+        yield "lost", {"robot": name, "topic": topic, "why": why}, count
     spool = robot.spool.statistics()
-    for state, chunks in (("all", spool.chunks), ("not stored", spool.unstored), ("set aside", spool.aside)):
-        SPOOL_CHUNKS.labels(name, state).set(chunks)
-    SPOOL_BYTES.labels(name).set(spool.bytes)
-    SPOOL_DROPPED.labels(name).set(spool.dropped_bodies)
-    CONNECTED.labels(name).set(robot.sender.connected)
+    yield "spool_chunks", {"robot": name, "state": "all"}, spool.chunks
+    yield "spool_chunks", {"robot": name, "state": "not stored"}, spool.unstored
+    yield "spool_chunks", {"robot": name, "state": "set aside"}, spool.aside
+    yield "spool_bytes", {"robot": name}, spool.bytes
+    yield "spool_dropped", {"robot": name}, spool.dropped_bodies
+    yield "connected", {"robot": name}, robot.sender.connected
     if robot.sender.forked:
-        FORKED.labels(name).set(wall)
-    for condition, holds in {
-        "robot has a session": robot.sender.connected, "server's name has an address": robot.loop.resolved,
-        "spool takes chunks": robot.spool_trouble.why is None,
-    }.items():
-        CONDITION.labels("robot", condition).set(holds)
+        yield "forked_seconds", {"robot": name}, wall
+    yield "condition", {"process": "robot", "name": "robot has a session"}, robot.sender.connected
+    yield "condition", {"process": "robot", "name": "server's name has an address"}, robot.loop.resolved
+    yield "condition", {"process": "robot", "name": "spool takes chunks"}, robot.spool_trouble.why is None

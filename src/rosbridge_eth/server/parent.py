@@ -133,7 +133,7 @@ class Parent:
         return config
 
     def _begin(self, config: ServerConfig) -> None:
-        for file in self._home.path.glob(".shard-*.prom"):  # of a server that was killed and had more of them
+        for file in self._home.path.glob(".shard-*.json"):  # of a server that was killed and had more of them
             if int(file.stem.rpartition("-")[2]) >= config.shards:
                 file.unlink(missing_ok=True)
         self._children = {shard: Child() for shard in self._shards(config)}
@@ -187,7 +187,7 @@ def _child(
     for number in (signal.SIGINT, signal.SIGHUP):  # they reach the whole group; the parent ends the children
         signal.signal(number, signal.SIG_IGN)
     try:
-        metrics.STARTS.labels(name_of(shard)).set(starts)
+        metrics.show([("starts", {"process": name_of(shard)}, starts)])
         run_shard(shard, config, home, secrets, lambda: asked.is_set() or os.getppid() != parent)
     except BridgeError as error:
         log.error("%s", error)

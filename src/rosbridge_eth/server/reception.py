@@ -146,7 +146,7 @@ class Reception:
             verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, chunk)
         except (Forged, Altered) as error:
             self.counts["refused"] += 1
-            log.error("%s: %s is refused: %s", session.peer, chunk.header, error)
+            self._tell(session, "a chunk is refused", now, f": {error}")
             session.refused = chunk.header.digest
             self._turn_away(session)
             return
@@ -244,10 +244,10 @@ class Reception:
         self.forked[session.peer.name] = now
         self._tell(session, FORKED, now)
 
-    def _tell(self, session: Session, what: str, now: float) -> None:
+    def _tell(self, session: Session, what: str, now: float, more: str = "") -> None:
         """Log it, at most once a minute for a robot."""
         if now - self._said.get((session.peer.name, what), -NEVER) >= SAY_AGAIN:
-            log.warning("%s: %s", session.peer, what)
+            log.warning("%s: %s%s", session.peer, what, more)
             self._said[session.peer.name, what] = now
 
     def _say(self, session: Session) -> None:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
+from socket import socket
 from typing import TYPE_CHECKING
 
 from rosbridge_eth.channel import Mode, Server, ServerConfig, cookie_key
@@ -147,28 +148,35 @@ class Shard:
         submitting.result()
 
 
+def open_shard(
+    config: Settings, home: OperatorHome, secrets: Secrets, ledger: Ledger, sock: socket, shard: int = 0
+) -> Shard:
+    """Both halves; each has a registry and a store of its own, since they run in two threads."""
+    reception = open_reception(
+        config, secrets.identity, home, Registry(home.registry), open_store(config, home, shard), shard
+    )
+    store, registry = open_store(config, home, shard), Registry(home.registry)
+    submitter = open_submitter(config, ledger, store, registry, secrets.keys, shard)
+    return Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
+
+
 def run_shard(
     shard: int, config: Settings, home: OperatorHome, secrets: Secrets, stopped: Callable[[], bool]
 ) -> None:
-    """A shard, as a process of its own. Raises BridgeError where a part cannot be had, or is exchanged."""
+    """A shard, as a process of its own. Raises BridgeError where a part is missing, or is exchanged."""
     name, file = name_of(shard), metrics.file_of(home.path, name_of(shard))
-    store, reception = open_store(config, home, shard), open_reception(
-        config, secrets.identity, home, Registry(home.registry), open_store(config, home, shard), shard
-    )
     registry, ledger = Registry(home.registry), Ledger.connect(config.chain.url, home.deployment())
-    submitter = open_submitter(config, ledger, store, registry, secrets.keys, shard)  # which has its own of all
-    sock = server_socket(config.listen.next(shard))
-    made = Shard(Worker(reception, lambda handle: UdpLoop(reception.server, sock, handle)), submitter)
+    made = open_shard(config, home, secrets, ledger, server_socket(config.listen.next(shard)), shard)
     beats = metrics.Beats()
 
     def show() -> None:
         if beats.due():
-            metrics.show_worker(name, made.worker, time.time())
+            metrics.show(metrics.of_worker(name, made.worker, time.time()))
             metrics.save(file)
 
     def show_submitter() -> None:
         robots = robots_of(shard, config, registry)
-        metrics.show_submitter(name, submitter, store, robots, home.path, time.time())
+        metrics.show(metrics.of_submitter(name, made.submitter, robots, home.path, time.time()))
 
     with closing(ledger), metrics.served(config.monitor and config.monitor.next(shard)):
         made.run(stopped, on_turn=show, on_submit=show_submitter)

@@ -129,7 +129,7 @@ class Submitter:
         account: Callable[[bytes], LocalAccount | None], operator: LocalAccount | None, settings: Settings,
         others: Callable[[], Collection[bytes]] = tuple,
     ) -> None:  # fmt: skip
-        self._ledger, self._store, self._robots, self._others = ledger, store, robots, others
+        self._ledger, self.store, self._robots, self._others = ledger, store, robots, others
         self._account, self._operator, self._settings = account, operator, settings
         self._known: dict[bytes, Account] = {}
         self._funds, self._paid = Account(), list[Standing]()
@@ -171,11 +171,11 @@ class Submitter:
 
     def _forget(self, now: float) -> None:
         """Confirmed rows that are a day old, looked for once an hour, or fill half of a robot's share."""
-        half, hour = self._store.max_bytes_per_robot // 2, not 0 <= now - self._hour_at < HOUR
+        half, hour = self.store.max_bytes_per_robot // 2, not 0 <= now - self._hour_at < HOUR
         self._hour_at = now if hour else self._hour_at
-        for tk, size in self._store.sizes().items():
+        for tk, size in self.store.sizes().items():
             if tk in self.standings and (hour or size > half):
-                self._store.forget(tk, now - DAY, half)
+                self.store.forget(tk, now - DAY, half)
 
     # ------------------------------------------------------------------ look
 
@@ -188,7 +188,7 @@ class Submitter:
         self.standings = standings = dict(zip(robots, self._ledger.standings(robots), strict=True))
         then = self._then(robots, head)
         work = []
-        for tk, state in zip(robots, self._store.states(robots), strict=True):
+        for tk, state in zip(robots, self.store.states(robots), strict=True):
             account = self._known.setdefault(tk, Account(gas=self._settings.gas_per_day * BURST / DAY, gas_at=now))
             look = Look(standings[tk], then.get(tk), state)
             if look != account.quiet:
@@ -227,7 +227,7 @@ class Submitter:
                 changes = self._confirmed(tk, account, then, state)
             changes["certificates"] = contract.NOTHING if standing.revoked else standing.certificates_hash
             self._may_write(tk, standing)
-            if after is not None and (rows := self._store.rows(tk, after, 1)) and rows[0].place <= state.head:
+            if after is not None and (rows := self.store.rows(tk, after, 1)) and rows[0].place <= state.head:
                 found.append(Work(tk, standing, after, state.head, rows[0].taken_at))
             else:
                 account.hold, account.flights = "", []
@@ -235,24 +235,24 @@ class Submitter:
             account.hold, account.flights = str(why), []
         changes["hold"] = account.hold
         if any(getattr(state, name) != value for name, value in changes.items()):
-            self._store.set_state(tk, **changes)
+            self.store.set_state(tk, **changes)
         return found
 
     def _place(self, tk: bytes, standing: Standing, state: State) -> bytes | None:
         """The place behind which the rows are not on the chain; None: the store followed the chain just now."""
         if standing.tail == state.base or standing.account is None:
             return NOWHERE
-        place = self._store.find(tk, standing.tail)
+        place = self.store.find(tk, standing.tail)
         if place is not None and place <= state.head:
             return place
-        self._store.follow(tk, standing.tail, self._last(tk, standing))
+        self.store.follow(tk, standing.tail, self._last(tk, standing))
         self.counts["followed"] += 1
         return None
 
     def _confirmed(self, tk: bytes, account: Account, then: Standing, state: State) -> dict[str, Any]:
         """What the state is to say of the last chunk that is confirmed; nothing new where it is not known."""
         if then.tail != account.final[0]:
-            place = NOWHERE if not then.chunks else self._store.find(tk, then.tail)
+            place = NOWHERE if not then.chunks else self.store.find(tk, then.tail)
             if place is None and then.tail == state.base and (header := self._last(tk, then)):
                 place = place_of(header)  # the store followed the chain, and has no row of it
             if place is None:
@@ -304,7 +304,7 @@ class Submitter:
         for w, (latest, pending) in sorted(steady, key=lambda item: item[0].oldest):
             account = self._known[w.tk]
             try:
-                rows = [row for row in self._store.rows(w.tk, w.after, ROWS) if row.place <= w.head]
+                rows = [row for row in self.store.rows(w.tk, w.after, ROWS) if row.place <= w.head]
                 self._reconcile(account, w.standing, rows, latest, now)
                 if (again := self._again(account, latest, pending, now)) is None:
                     continue
@@ -402,7 +402,7 @@ class Submitter:
         return True
 
     def _calldata(self, tk: bytes, batch: Batch) -> bytes:
-        chunks = self._store.chunks(tk, [row.place for row in batch.rows])
+        chunks = self.store.chunks(tk, [row.place for row in batch.rows])
         return self._ledger.calldata("setData", tk, batch.first, batch.tail, chunks)
 
     def _signed(self, tk: bytes, account: Account, nonce: int, batch: Batch) -> bytes:

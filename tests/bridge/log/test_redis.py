@@ -19,7 +19,8 @@ import redis
 
 from bridge.chunks import chain
 from bridge.redis_server import DURABLE, RedisClusterServer, RedisServer
-from rosbridge_eth.errors import StoreError
+from rosbridge_eth.errors import ConfigError, StoreError
+from rosbridge_eth.log import opening
 from rosbridge_eth.log import redis as redis_module
 from rosbridge_eth.log.chunk import Chunk
 from rosbridge_eth.log.redis import COMMANDS, RedisStore
@@ -220,6 +221,13 @@ def test_a_replica_takes_nothing_and_says_so(start):
 
 
 # --- outages
+
+
+def test_without_the_package_one_sentence_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(opening, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'pysmcrypto\[redis\]'"):
+        opening.open_store("redis://127.0.0.1:1", file=tmp_path / "s", ledger=bytes(32), max_bytes=1,
+                           max_bytes_per_robot=1)  # fmt: skip
 
 
 def test_no_redis_there_is_told_with_the_mend_and_the_password_is_not():

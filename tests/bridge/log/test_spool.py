@@ -68,7 +68,7 @@ def numbers(chunks: list[Chunk]) -> list[int]:
 def test_an_empty_spool_knows_nothing(spool):
     assert (spool.newest, spool.last_digest, all_of(spool)) == (NOWHERE, NO_DIGEST, [])
     assert set(spool.statistics()) == {0}
-    assert not spool.has(NO_DIGEST)
+    assert spool.place(NO_DIGEST) is None
 
 
 def test_chunks_come_back_unchanged_in_the_order_of_the_log(spool):
@@ -77,7 +77,7 @@ def test_chunks_come_back_unchanged_in_the_order_of_the_log(spool):
     assert all_of(spool) == [*first, *second]
     assert [row.place for row in spool.rows(place(first[1]), 2)] == [place(first[2]), place(second[0])]
     assert (spool.newest, spool.last_digest) == (place(second[1]), second[1].header.digest)
-    assert all(spool.has(one.header.digest) for one in (*first, *second))
+    assert all(spool.place(one.header.digest) == place(one) for one in (*first, *second))
 
 
 def test_what_is_confirmed_leaves_with_all_before_it_and_what_the_next_chunk_needs_stays(path, spool):
@@ -129,7 +129,7 @@ def test_what_is_refused_is_set_aside_and_not_sent_again(path, spool):
     made = fill(spool, 4)
     assert spool.set_aside(made[2].header.digest) == place(made[2])
     assert spool.set_aside(made[2].header.digest) is None
-    assert not spool.has(made[2].header.digest)
+    assert spool.place(made[2].header.digest) is None
     assert all_of(spool) == [*made[:2], made[3]]
     assert (spool.statistics().aside, spool.statistics().chunks) == (1, 3)
     spool.confirmed(spool.newest)

@@ -257,10 +257,10 @@ def test_a_trigger_that_is_gone_after_a_reload_has_no_figures(robot: RobotHome):
     robot.config.write_text(f'{topics.replace("NAME", "fall")}{one}[[trigger]]\nname = "fall"\n')
     made = open_robot(robot, load_robot_config(robot.config), PASSWORD)
     with closing(made.spool), closing(made.loop):
-        metrics.show_robot("robot_1", made, 1.0)
+        metrics.show(metrics.of_robot("robot_1", made, 1.0))
         robot.config.write_text(topics.replace("NAME", "crash") + one)
         made.reload(load_robot_config(robot.config), [READER.encryption_certificate.public_key])
-        metrics.show_robot("robot_1", made, 2.0)
+        metrics.show(metrics.of_robot("robot_1", made, 2.0))
         metrics.save(metrics.file_of(robot.path, "robot"))
         figures = metrics.running(robot.path)["robot"] or []
         named = {labels["trigger"] for _, labels, _ in figures if "trigger" in labels}

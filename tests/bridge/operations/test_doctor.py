@@ -16,7 +16,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
 from bridge.chunks import chain as chunk_chain
 from bridge.disks import fill_up, small_disk
@@ -218,12 +217,10 @@ def test_an_operators_home_whose_parts_work_is_sound(place: Place, on_chain: Non
 @contextmanager
 def runs(home: Path, name: str, **conditions: bool) -> Iterator[None]:
     """What a process of this home leaves while it runs."""
-    figures = CollectorRegistry()
-    gauge = Gauge("rosbridge_eth_condition", "", ["process", "name"], registry=figures)
-    for condition, holds in conditions.items():
-        gauge.labels(name, condition).set(holds)
+    metrics.FIGURES.clear()
+    metrics.show(("condition", {"process": name, "name": condition}, holds) for condition, holds in conditions.items())
     file = metrics.file_of(home, name)
-    write_to_textfile(str(file), figures)
+    metrics.save(file)
     yield
     file.unlink()
 

@@ -109,7 +109,7 @@ from pathlib import Path
 from rosbridge_eth.server import metrics
 from rosbridge_eth.config.home import RobotHome
 place = RobotHome(Path("robot"))
-metrics.FIRED.labels("robot_1", "crash").set(0)
+metrics.show([("trigger_fired", {"robot": "robot_1", "trigger": "crash"}, 0)])
 metrics.save(metrics.file_of(place.path, "robot"))
 print("up", flush=True)
 while not place.event("crash").exists():

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from bridge.disks import fill_up, small_disk
 from ports import free_port
 from rosbridge_eth.config.values import Address
-from rosbridge_eth.errors import NetworkError
+from rosbridge_eth.errors import ConfigError, NetworkError
 from rosbridge_eth.server import metrics
 
 
@@ -30,11 +28,13 @@ def ask(address: Address) -> tuple[int, str]:
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_the_figures_are_served_as_long_as_the_process_runs(host: str):
     address = Address(host, free_port())
-    metrics.CAPTURED.labels("robot_1").set(3)
+    metrics.show([("captured", {"robot": "robot_1"}, 3)])
     try:
         with metrics.served(address):
             status, body = ask(address)
-            assert status == 200 and metrics.parsed(body) == [("captured", {"robot": "robot_1"}, 3.0)]
+            assert status == 200
+            [sample] = [sample for family in text_string_to_metric_families(body) for sample in family.samples]
+            assert (sample.name, sample.labels, sample.value) == ("rosbridge_eth_captured", {"robot": "robot_1"}, 3.0)
             with pytest.raises(NetworkError, match="correct `monitor`"), metrics.served(address):
                 pass
     except NetworkError:
@@ -46,19 +46,16 @@ def test_the_figures_are_served_as_long_as_the_process_runs(host: str):
         pass
 
 
-def test_nothing_is_shown_before_somebody_has_said_it():
-    script = (
-        "from prometheus_client import generate_latest; from rosbridge_eth.server import metrics;"
-        " print(generate_latest(metrics.REGISTRY).decode())"
-    )
-    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
-                           env={**os.environ, "PYTHONPATH": str(Path(metrics.__file__).parents[2])}).stdout
-    samples = [sample for family in text_string_to_metric_families(shown) for sample in family.samples]
-    assert samples == [], "a server that has no robot's figures rings no robot's alarm"
+def test_without_the_package_one_sentence_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(metrics, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install '.*\[metrics\]'"), metrics.served(Address("127.0.0.1", 0)):
+        pass
+    with metrics.served(None):
+        pass
 
 
 def test_a_home_shows_the_figures_of_each_of_its_processes_and_which_were_killed(tmp_path: Path):
-    metrics.CAPTURED.labels("robot_1").set(7)
+    metrics.show([("captured", {"robot": "robot_1"}, 7)])
     for process in ("shard-0", "shard-1"):
         metrics.save(metrics.file_of(tmp_path, process))
     before = time.time() - metrics.SILENCE - 1
@@ -67,27 +64,20 @@ def test_a_home_shows_the_figures_of_each_of_its_processes_and_which_were_killed
 
 
 def test_what_hangs_and_what_does_not_hold_are_named():
-    metrics.BEAT.labels("shard-0").set(1000.0)
-    metrics.BEAT.labels("shard-0 submitter").set(1000.0 - metrics.SILENCE)
-    metrics.CONDITION.labels("shard-0", "node answers").set(1)
-    metrics.CONDITION.labels("shard-0", "disk has room").set(0)
-    figures = metrics.parsed(shown())
-    assert metrics.failing(figures) == ["shard-0: disk has room"]
-    metrics.BEAT.labels("shard-0").set(1001.0)
-    assert metrics.failing(metrics.parsed(shown())) == ["shard-0 submitter works", "shard-0: disk has room"]
-
-
-def shown() -> str:
-    from prometheus_client import generate_latest
-
-    return generate_latest(metrics.REGISTRY).decode()
+    metrics.show([("beat_seconds", {"process": "shard-0"}, 1000.0)])
+    metrics.show([("beat_seconds", {"process": "shard-0 submitter"}, 1000.0 - metrics.SILENCE)])
+    metrics.show([("condition", {"process": "shard-0", "name": "node answers"}, 1)])
+    metrics.show([("condition", {"process": "shard-0", "name": "disk has room"}, 0)])
+    assert metrics.failing(metrics.figures()) == ["shard-0: disk has room"]
+    metrics.show([("beat_seconds", {"process": "shard-0"}, 1001.0)])
+    assert metrics.failing(metrics.figures()) == ["shard-0 submitter works", "shard-0: disk has room"]
 
 
 @pytest.mark.service
 def test_on_a_full_disk_a_process_is_still_seen_to_run(tmp_path: Path):
     with small_disk(tmp_path / "disk", "1m") as disk:
         file = metrics.file_of(disk, "shard-0")
-        metrics.CAPTURED.labels("robot_1").set(7)
+        metrics.show([("captured", {"robot": "robot_1"}, 7)])
         metrics.save(file)
         os.utime(file, (1.0, 1.0))
         assert metrics.running(disk) == {"shard-0": None}
@@ -98,7 +88,7 @@ def test_on_a_full_disk_a_process_is_still_seen_to_run(tmp_path: Path):
 
 
 def test_a_robots_file_in_a_folder_that_is_gone_is_no_trouble(tmp_path: Path):
-    metrics.save(tmp_path / "absent" / ".robot.prom")
+    metrics.save(tmp_path / "absent" / ".robot.json")
     assert metrics.running(tmp_path / "absent") == {}
 
 

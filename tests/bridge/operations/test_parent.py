@@ -88,7 +88,7 @@ def test_who_starts_a_second_one_by_mistake_leaves_the_first_its_figures(
     place: Place, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(parent.Ledger, "check", lambda ledger: None)
-    metrics.BEAT.labels("shard-0").set(1.0)
+    metrics.show([("beat_seconds", {"process": "shard-0"}, 1.0)])
     metrics.save(metrics.file_of(place.operator.path, "shard-0"))
     with closing(server_socket(Address("127.0.0.1", 0))) as door:
         place.configure('listen = "127.0.0.1:0"', f'listen = "127.0.0.1:{door.getsockname()[1]}"')

@@ -290,7 +290,7 @@ def test_sighup_reloads_server_toml_and_the_robots_go_on(bridge: Bridge):
             written = bridge.figures().get("chain_chunks robot_1", 0)
             bridge.until("what follows", lambda written=written: (
                 bridge.figures().get("chain_chunks robot_1", 0) > written + 1))
-            assert len(list((bridge.path / "operator").glob(".shard-*.prom"))) == shards
+            assert len(list((bridge.path / "operator").glob(".shard-*.json"))) == shards
     finally:
         bridge.shards = 2
         config.write_text(good)

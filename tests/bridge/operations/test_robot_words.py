@@ -137,7 +137,7 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
     captured = len(list(robot.source.messages()))  # type: ignore[attr-defined]
 
     def on_turn() -> None:
-        metrics.show_robot("robot_1", robot, 0.0)
+        metrics.show(metrics.of_robot("robot_1", robot, 0.0))
         if robot.captured == captured and robot.sender.refusal:
             robot.stop()
 

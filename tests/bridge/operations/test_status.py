@@ -102,8 +102,8 @@ def test_a_revoked_robot_is_no_alarm_unless_some_of_its_chunks_wait(
 
         def alarms(now: float) -> tuple[list[str], float]:
             submitter.turn(now)
-            metrics.show_submitter("shard-0", submitter, inbox, registry.robots(), place.operator.path, now)
-            return status(capsys)["alarms"], metrics.HELD.labels("robot_1")._value.get()
+            metrics.show(metrics.of_submitter("shard-0", submitter, registry.robots(), place.operator.path, now))
+            return status(capsys)["alarms"], metrics.FIGURES["on_hold", (("robot", "robot_1"),)]
 
         now = time.time()
         assert alarms(now) == ([], 0)
@@ -233,7 +233,7 @@ def test_a_node_that_is_behind_a_registration_is_told_as_such(
 def test_no_address_is_broken_at_80_columns(place: Place, monkeypatch: Patch, capsys: Capture):
     monkeypatch.setenv("COLUMNS", "80")
     source = "[2001:db8:1234:5678:9abc:def0:1234:5678]:54321"
-    metrics.SESSION.labels("robot_1", source).set(time.time())
+    metrics.show([("session_seen_seconds", {"robot": "robot_1", "address": source}, time.time())])
     metrics.save(metrics.file_of(place.operator.path, "shard-0"))
     assert run(["status"]) == 0
     shown = capsys.readouterr().out
@@ -311,13 +311,13 @@ def test_a_redis_is_looked_at_and_left_as_it_is_and_its_absence_is_told(place: P
 def test_who_is_connected_and_what_comes_from_them_is_what_the_running_shards_show(place: Place, capsys: Capture):
     now = time.time()
     files = [metrics.file_of(place.operator.path, f"shard-{shard}") for shard in range(2)]
-    metrics.BEAT.labels("shard-0").set(now)
-    metrics.SESSION.labels("robot_1", "192.0.2.1").set(now - 3600)
-    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now)
-    metrics.SESSION.labels("robot_2", "192.0.2.3").set(now)
-    metrics.RATE.labels("shard-0", "robot_1").set(12.5)
-    metrics.NEWEST.labels("shard-0", "robot_1").set(now - 30)
-    metrics.GAS.labels("robot_1").set(123_000)
+    metrics.show([("beat_seconds", {"process": "shard-0"}, now)])
+    metrics.show([("session_seen_seconds", {"robot": "robot_1", "address": "192.0.2.1"}, now - 3600)])
+    metrics.show([("session_seen_seconds", {"robot": "robot_1", "address": "192.0.2.2"}, now)])
+    metrics.show([("session_seen_seconds", {"robot": "robot_2", "address": "192.0.2.3"}, now)])
+    metrics.show([("records_per_second", {"process": "shard-0", "robot": "robot_1"}, 12.5)])
+    metrics.show([("newest_chunk_seconds", {"process": "shard-0", "robot": "robot_1"}, now - 30)])
+    metrics.show([("gas", {"robot": "robot_1"}, 123_000)])
     metrics.save(files[0])
     files[1].touch()
     report = status(capsys)
@@ -325,8 +325,8 @@ def test_who_is_connected_and_what_comes_from_them_is_what_the_running_shards_sh
     assert (robot["connected"], robot["address"]) == (True, "192.0.2.2") and "robot_2" not in report["robots"]
     assert (robot["rate"], robot["gas"]) == (12.5, 123_000) and 30 <= robot["newest"] < 60
     assert report["process"] == []
-    metrics.SESSION.labels("robot_1", "192.0.2.2").set(now - 3000)
-    metrics.CONDITION.labels("shard-0", "node answers").set(0)
+    metrics.show([("session_seen_seconds", {"robot": "robot_1", "address": "192.0.2.2"}, now - 3000)])
+    metrics.show([("condition", {"process": "shard-0", "name": "node answers"}, 0)])
     metrics.save(files[0])
     report = status(capsys)
     assert report["robots"]["robot_1"]["connected"] is False
@@ -338,8 +338,8 @@ def test_who_is_connected_and_what_comes_from_them_is_what_the_running_shards_sh
 
 def test_a_shard_or_a_server_that_was_killed_is_not_ready(place: Place, capsys: Capture):
     files = [metrics.file_of(place.operator.path, f"shard-{shard}") for shard in range(2)]
-    metrics.BEAT.labels("shard-0").set(time.time())
-    metrics.RATE.labels("shard-0", "robot_1").set(12.5)
+    metrics.show([("beat_seconds", {"process": "shard-0"}, time.time())])
+    metrics.show([("records_per_second", {"process": "shard-0", "robot": "robot_1"}, 12.5)])
     for killed in range(2):
         for each in files:
             metrics.save(each)
@@ -360,13 +360,13 @@ def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Pla
     from rich.console import Console
 
     screen = Console(width=100, record=True, file=io.StringIO())
-    metrics.BEAT.labels("shard-0").set(time.time())
-    metrics.SESSION.labels("robot_1", "192.0.2.2").set(time.time())
-    metrics.WAITING.labels("robot_1").set(7)
-    metrics.OLDEST.labels("robot_1").set(300)
-    metrics.ON_CHAIN.labels("robot_1").set(41)
-    metrics.BLOCK.labels("robot_1").set(99)
-    metrics.HELD.labels("robot_1").set(1)
+    metrics.show([("beat_seconds", {"process": "shard-0"}, time.time())])
+    metrics.show([("session_seen_seconds", {"robot": "robot_1", "address": "192.0.2.2"}, time.time())])
+    metrics.show([("waiting_chunks", {"robot": "robot_1"}, 7)])
+    metrics.show([("waiting_seconds", {"robot": "robot_1"}, 300)])
+    metrics.show([("chain_chunks", {"robot": "robot_1"}, 41)])
+    metrics.show([("chain_block", {"robot": "robot_1"}, 99)])
+    metrics.show([("on_hold", {"robot": "robot_1"}, 1)])
     metrics.save(metrics.file_of(place.operator.path, "shard-0"))
     screen.print(module.fleet(place.operator))
     shown = screen.export_text()
@@ -416,7 +416,7 @@ def test_a_running_robot_shows_its_figures(place: Place, capsys: Capture):
     place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
     robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
     try:
-        metrics.show_robot("robot_1", robot, time.time())
+        metrics.show(metrics.of_robot("robot_1", robot, time.time()))
         metrics.save(metrics.file_of(place.robot.path, "robot"))
         report = status(capsys, "--home", "robot")
         assert "robot: robot has a session" in report["process"]
@@ -428,19 +428,19 @@ def test_a_running_robot_shows_its_figures(place: Place, capsys: Capture):
 
 def test_a_log_that_goes_on_in_two_places_is_an_alarm_on_both_ends(place: Place, capsys: Capture):
     now, report = time.time(), status(capsys)
-    metrics.BEAT.labels("shard-0").set(now)
+    metrics.show([("beat_seconds", {"process": "shard-0"}, now)])
     for age, told in ((700.0, False), (5.0, True)):
-        metrics.FORKED.labels("robot_1").set(now - age)
+        metrics.show([("forked_seconds", {"robot": "robot_1"}, now - age)])
         metrics.save(metrics.file_of(place.operator.path, "shard-0"))
         report = status(capsys)
         assert (f"ALARM: robot_1: {FORKED}" in report["alarms"]) == told
     place.robot.config.write_text('topics = ["/robot_1/odom"]\n[source]\nkind = "sim"\n')
-    metrics.FORKED.clear()
+    metrics.FIGURES.clear()
     robot = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
     try:
         for held in ("", FORKED):
             robot.sender.held = held
-            metrics.show_robot("robot_1", robot, time.time())
+            metrics.show(metrics.of_robot("robot_1", robot, time.time()))
             metrics.save(metrics.file_of(place.robot.path, "robot"))
             assert status(capsys, "--home", "robot")["alarms"] == ([f"ALARM: {FORKED}"] if held else [])
         assert run(["status", "--home", "robot"]) == 0

@@ -648,6 +648,12 @@ def test_without_pyarrow_a_parquet_file_is_refused_before_anything_is_read(tmp_p
     outputs.check_table(tmp_path / "t.csv")
 
 
+def test_without_matplotlib_a_picture_is_refused_before_anything_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(outputs, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'pysmcrypto\[plot\]'"):
+        outputs.check_picture(tmp_path / "t.png")
+
+
 # --- files that grow
 
 

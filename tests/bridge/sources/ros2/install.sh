@@ -10,4 +10,4 @@ root=$(cd "$(dirname "$0")/../../../.." && pwd)
 "$place/bin/python" -m pip install -q --disable-pip-version-check \
   'ros-rclpy[fastrtps]' ros-std-msgs ros-nav-msgs ros-sensor-msgs ros-test-msgs
 # The bridge's packages, and the bridge as it is in the checkout.
-"$place/bin/python" -m pip install -q --disable-pip-version-check -e "$root[bridge]"
+"$place/bin/python" -m pip install -q --disable-pip-version-check -e "$root[bridge,metrics]"

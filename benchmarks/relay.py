@@ -1,6 +1,6 @@
 """A bad network on one machine: a UDP relay that loses, doubles and reorders what passes through it.
 
-For `demo --loss`, and for tests where the kernel's own (tc netem) is not permitted. One client at a time is told from
+For tests where the kernel's own (tc netem) is not permitted. One client at a time is told from
 the server by its address.
 """
 
@@ -35,7 +35,7 @@ class Relay:
 
     def __init__(self, server: Place, harm: Harm, on_datagram: Callable[[bytes], None] = lambda data: None) -> None:
         self._server, self._harm, self._on_datagram = server, harm, on_datagram
-        self._chance = random.Random(harm.seed).random  # noqa: S311 - a bad network, not a secret
+        self._chance = random.Random(harm.seed).random
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.settimeout(0.05)
