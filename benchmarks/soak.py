@@ -30,6 +30,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ class CliqueSite(Site):
         program, key = geth_network.find_geth("clique"), geth_network.new_key()
         self.geth = geth_network.Node(program, self.folder / "geth", key, {
             "mine": None, "miner.gaslimit": geth_network.GAS_LIMIT, "gcmode": "archive"})
-        rich = {Keyring.from_mnemonic(WORDS).operator.address: 10**6 * 10**18}
+        rich: dict[str, int] = {Keyring.from_mnemonic(WORDS).operator.address: 10**6 * 10**18}
         self.geth.init(geth_network.genesis([self.geth.signer], rich, 1, geth_network.GAS_LIMIT))
         self.geth.start()
         words = self.folder / "words"
@@ -99,6 +100,9 @@ class CliqueSite(Site):
         with closing(self._store_of(robot)) as store:
             waiting, [state] = store.waiting(robot), store.states([robot])
         return f"{waiting.chunks} chunks wait ({state.hold})" if waiting.chunks else ""
+
+    def is_done(self, robot: bytes) -> bool:
+        return not self.outstanding(robot)
 
     def dead_letters(self, robot: bytes) -> set[bytes]:
         with closing(self._store_of(robot)) as store:
@@ -216,7 +220,8 @@ class Faults:
 def run(records: int, robots: int, rate: float, seed: int) -> tuple[list[Count], Counter[str], dict[str, float]]:
     """One soak: a count for each robot, the faults by name, and figures."""
     with tempfile.TemporaryDirectory(prefix="soak-") as folder, ExitStack() as stack:
-        site = stack.enter_context(CliqueSite(Path(folder)))
+        site = CliqueSite(Path(folder))
+        stack.callback(site.close)
         flows = [SimFlow(site, number, rate, seed + number) for number in range(1, robots + 1)]
         began = time.monotonic()
         for flow in flows:
@@ -233,7 +238,7 @@ def run(records: int, robots: int, rate: float, seed: int) -> tuple[list[Count],
         for flow in flows:
             flow.last_life()
         for flow in flows:
-            until(f"all of {flow.name} is on the chain", lambda flow=flow: not site.outstanding(flow.robot), LONG)
+            until(f"all of {flow.name} is on the chain", partial(site.is_done, flow.robot), LONG)
         confirmed = time.monotonic() - began
         counts = [flow.audit() for flow in flows]
         figures = {"seconds to the last confirmation": confirmed, "seconds with reading": time.monotonic() - began,
