@@ -31,7 +31,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -146,7 +145,8 @@ class SimFlow(Flow):
         """Records whose tick does not follow the one before, and that do not say what the simulation says at it."""
         unlike, ticks = 0, [content(record.content) for record in log.records]
         longest = 1 + max((tick for tick, _ in ticks), default=0)
-        expected = [(m.x, m.y, m.speed) for m in islice(drive(1, self._rate), longest)]
+        places = (drive(round(tick * 1e9 / self._rate) / 1e9) for tick in range(longest))
+        expected = [(place.x, place.y, place.turn) for place in places]
         next_tick = 0
         for tick, said in ticks:
             unlike += tick not in (next_tick, 0)
@@ -156,10 +156,10 @@ class SimFlow(Flow):
 
 
 def content(line: MessageLine) -> tuple[int, tuple[float, float, float]]:
-    """Tick, x, y and speed of an odometry record."""
+    """Tick, x, y and turn of an odometry record."""
     data: Any = line.data
     position = data["pose"]["pose"]["position"]
-    return data["header"]["seq"], (position["x"], position["y"], data["twist"]["twist"]["linear"]["x"])
+    return data["header"]["seq"], (position["x"], position["y"], data["twist"]["twist"]["angular"]["z"])
 
 
 def copy_of(store: Path, copy: Path) -> None:
