@@ -396,7 +396,7 @@ def _register(
     put = ledger.registration if standing.account is None else ledger.replace_registration
     first = registry.next_number()
     for number in range(first, first + ACCOUNTS_TRIED):
-        account = keys.robot(number).address
+        account = keys.account(number).address
         try:
             return number, account, put(keys.operator, tk, account, certificates).block
         except Reverted as refused:

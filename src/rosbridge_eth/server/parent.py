@@ -33,8 +33,7 @@ log = logging.getLogger(__name__)
 
 WATCH = 0.2  # seconds between looks at the children
 GRACE = 10.0  # seconds for children to end in good order
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0  # seconds before a shard that ended is started again
-LONG_LIFE = 60.0  # seconds after which a shard that ends is as one that ends for the first time
+PAUSE = 2.0  # seconds before a shard that ended is started again
 _FORK = multiprocessing.get_context("fork")
 
 
@@ -50,19 +49,12 @@ def notify(state: str) -> None:
 
 @dataclass(slots=True)
 class Child:
-    """A shard's process. due: when it is started, or started again; None while it runs. pause: seconds before that."""
+    """A shard's process. due: when it is started; None while it runs."""
 
     process: BaseProcess | None = None
     starts: int = 0
     since: float = 0.0
-    pause: float = 0.0
     due: float | None = float("-inf")
-
-    def ended(self, now: float) -> None:
-        """It ended: the pause grows, unless it lived long."""
-        longer = 0.0 if now - self.since > LONG_LIFE else 2 * self.pause
-        self.pause = min(LONGEST_PAUSE, max(FIRST_PAUSE, longer))
-        self.due = now + self.pause
 
 
 class Parent:
@@ -154,9 +146,9 @@ class Parent:
     def _look(self, config: ServerConfig, now: float) -> None:
         for shard, child in self._children.items():
             if child.due is None and child.process is not None and not child.process.is_alive():
-                child.ended(now)
+                child.due = now + PAUSE
                 log.error("%s ended with exit code %s after %.0f s; it is started again in %.0f s",
-                          name_of(shard), child.process.exitcode, now - child.since, child.pause)
+                          name_of(shard), child.process.exitcode, now - child.since, PAUSE)
             if child.due is not None and now >= child.due:
                 child.starts, child.since, child.due = child.starts + 1, now, None
                 task = (os.getpid(), child.starts, shard, config, self._home, self._secrets)

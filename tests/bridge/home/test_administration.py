@@ -208,7 +208,7 @@ def test_a_backup_of_a_home_in_use_is_a_home(world: World, tmp_path: Path) -> No
     with registry_of(copy) as known:
         assert [*known.robots()] == [TK]
     assert load_ca(copy.ca, PASSPHRASE, NOW)
-    assert Keyring.load(copy.accounts, PASSPHRASE).robot(3).address == made.account
+    assert Keyring.load(copy.accounts, PASSPHRASE).account(3).address == made.account
     assert (copy.bundles / "robot_1.bundle").read_bytes() == made.bundle.read_bytes()
     assert copy.deployment() == world.home.deployment() and not (copy.path / "submitter.lock").exists()
     with pytest.raises(ConfigError, match="already"):
@@ -538,7 +538,7 @@ def test_an_old_backup_of_the_registry_does_not_stop_registrations(world: World,
     assert new.account not in accounts
     with registry(world) as known:
         found = known.find("robot", "robot_4")
-    assert found is not None and found.account == new.account == world.keys.robot(found.number).address
+    assert found is not None and found.account == new.account == world.keys.account(found.number).address
     with pytest.raises(IdentityError, match="robot_2"):
         world.register("robot_2")
 
@@ -599,7 +599,7 @@ def test_a_robot_is_registered_also_where_its_account_gets_no_eth_at_once(
 
 def test_an_account_that_has_some_eth_is_given_up_to_what_the_contract_allows(world: World) -> None:
     world.home.config.write_text(world.home.config.read_text() + "\n[funds]\nby = 5\n")
-    account = world.keys.robot(3).address  # the server is 1, the owner 2
+    account = world.keys.account(3).address  # the server is 1, the owner 2
     operator = world.keys.operator
     fees = world.ledger.fees(world.ledger.block())
     [(nonce, _)] = world.ledger.nonces([operator.address])
