@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -264,13 +264,24 @@ def _robot(place: RobotHome) -> Report:
             running = _running(report, place.path, _SILENT)
             seen = [value for name, _, value in running if name == "forked_seconds"]
             report["alarms"] = [f"ALARM: {FORKED}" for value in seen if time.time() - value < FORKED_FOR]
-            wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
-                      "trigger_records")  # fmt: skip
-            report["figures"] = {
-                " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in running if name in wanted
-            }  # fmt: skip
+            report["figures"] = _of_robot(running)
     return report
+
+
+def _of_robot(running: Iterable[Figure]) -> dict[str, float]:
+    wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
+              "trigger_records")  # fmt: skip
+    return {" ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
+            for name, labels, value in running if name in wanted}  # fmt: skip
+
+
+def robot_picture(name: str, session: str, running: Iterable[Figure]) -> RenderableType:
+    """The picture of a running robot at its terminal, from its own figures."""
+    return table(name, ["what", "value"], [("session", session), *_rows(_of_robot(running))])
+
+
+def _rows(figures: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    return ((name.replace("_", " "), f"{value:,.0f}") for name, value in figures.items())
 
 
 # What is shown
@@ -350,7 +361,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("server", report["server"]), ("topics, nodes", ", ".join([*report["topics"], *report["nodes"]])),
         ("contract", report["contract"]), ("chain", report["chain"]), ("runs", "yes" if report["runs"] else "no"),
         ("spool", kept), *_process(report),
-        *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
+        *_rows(report.get("figures", {})),
     ])  # fmt: skip
     yield from report["alarms"]
 
