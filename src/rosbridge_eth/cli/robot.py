@@ -46,7 +46,7 @@ def join(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
     source: SourceOption = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics, by name or pattern; else you are asked.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: all topics of the ROS that is there.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: take all topics that are found.")] = False,
     password_file: terminal.PasswordFile = None,
 ) -> None:
     """Make this machine a robot: its keys, topics, and a request. The operator's `register` answers it.
@@ -131,7 +131,7 @@ def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> No
 
 def _say_who(joined: bundles.Joined) -> None:
     talk(f"The operator's CA is {grouped(joined.ca)}; compare it with what `register` showed.")
-    talk(f"It says that these may read what this robot writes: {', '.join(joined.readers) or 'nobody'}.")
+    talk(f"Readers who can open this robot's records: {', '.join(joined.readers) or 'nobody'}.")
 
 
 def robot(
@@ -139,7 +139,7 @@ def robot(
     password_file: terminal.PasswordFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Bring what the configured topics say to the server. Ends when it is stopped, or the source ends.
+    """Capture the configured topics and send them to the server. Ends when it is stopped, or the source ends.
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
@@ -210,7 +210,7 @@ def trigger(
     name: Annotated[str | None, typer.Argument(help="One of them; without it, all.")] = None,
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
 ) -> None:
-    """Have the robot write what it keeps in memory for an event. It runs with this home; the event is now."""
+    """Trigger an event now. The robot that runs with this home writes what it has in memory."""
     (place := RobotHome(home)).bridge()
     nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
     if (figures := metrics.running(home).get("robot")) is None:

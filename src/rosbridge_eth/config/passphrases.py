@@ -37,7 +37,7 @@ def read_passphrase(
     """The passphrase called `name` ("operator", "robot", "reader", "ca"), without its line end.
 
     Looked for in `file`, then where `passphrase_file` says, then asked for (twice with `confirm`). IdentityError
-    where there is none to be had. configured: the file that server.toml names.
+    where there is none. configured: the file that server.toml names.
     """
     if file := file or passphrase_file(name, configured=configured, environment=environment):
         return _from_file(file)

@@ -345,7 +345,7 @@ def register_robot(
             registry.require_free(Role.ROBOT, name)
             if standing.account is not None:
                 raise IdentityError(
-                    f"robot {name!r} was revoked; give --replace to enrol it anew, with a new account and new keys"
+                    f"robot {name!r} was revoked; give --replace to enrol it again, with a new account and new keys"
                     if standing.revoked else
                     f"the contract knows a robot {name!r} that the registry does not; give --replace to take it over"
                 )

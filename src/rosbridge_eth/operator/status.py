@@ -377,7 +377,7 @@ def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
                 raise ConfigError(f"{path} is the home of one robot; leave its name out")
             shown = _show_robot(report := _robot(RobotHome(path)))
         case HomeKind.READER:
-            raise ConfigError(f"a reader's home has nothing that goes on; try it with `doctor --home {path}`")
+            raise ConfigError(f"{path} is a reader's home, which has no status; run `doctor --home {path}`")
     return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
 
 
@@ -387,7 +387,7 @@ def status(
     follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
     json: Json = False,
 ) -> None:
-    """Show what is where: robots, what waits, balances, alarms. Of an operator's home, or a robot's.
+    """Show the state: robots, waiting chunks, balances, alarms. Of an operator's home, or a robot's.
 
     What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
     another chain than the contract.

@@ -135,7 +135,7 @@ def _text(value: Any) -> str:
 
 
 class Page:
-    """Serves a view from threads of its own until `close`. NetworkError where the address cannot be had."""
+    """Serves a view from threads of its own until `close`. NetworkError where the address cannot be opened."""
 
     def __init__(self, address: Address, view: View) -> None:
         files = resources.files(__package__)

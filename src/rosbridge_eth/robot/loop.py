@@ -394,7 +394,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
 
 
 def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConfig:
-    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, triggers,
+    """Reload robot.toml and the readers, without losing a message: topics, nodes, triggers,
     [capture] and readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from
     now on.
 

@@ -32,7 +32,7 @@ from rosbridge_eth.server.shard import Secrets, name_of, open_store, run_shard
 log = logging.getLogger(__name__)
 
 WATCH = 0.2  # seconds between looks at the children
-GRACE = 10.0  # seconds for children to end in good order
+GRACE = 10.0  # seconds for children to end
 PAUSE = 2.0  # seconds before a shard that ended is started again
 _FORK = multiprocessing.get_context("fork")
 
@@ -58,7 +58,7 @@ class Child:
 
 
 class Parent:
-    """Runs shards until `stop`, SIGTERM, SIGINT, or its terminal is gone. SIGHUP: all begin anew by server.toml."""
+    """Runs shards until `stop`, SIGTERM, SIGINT, or its terminal is gone. SIGHUP: all start again by server.toml."""
 
     def __init__(self, home: OperatorHome, secrets: Secrets, only: Sequence[int] = ()) -> None:
         """only: the shards that run here, where the others run elsewhere."""
@@ -132,7 +132,7 @@ class Parent:
         self._look(config, time.monotonic())
 
     def _reload(self, config: ServerConfig) -> ServerConfig:
-        """Begin anew by server.toml. What cannot be used is told, and nothing changes."""
+        """Begin again by server.toml. What cannot be used is told, and nothing changes."""
         try:
             new = self._checked()
         except BridgeError as error:
@@ -157,7 +157,7 @@ class Parent:
                 log.info("%s started, process %d", name_of(shard), child.process.pid)
 
     def _end(self) -> None:
-        """End the children in good order, and those that do not end within GRACE in any."""
+        """Ask the children to end; kill those that do not within GRACE."""
         running = [child.process for child in self._children.values() if child.process is not None]
         for process in running:
             process.terminate()
