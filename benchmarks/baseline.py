@@ -1,6 +1,6 @@
 """The same records into an ordinary replicated log with an anchor on the chain, beside the bridge, in one run.
 
-    python benchmarks/baseline.py [--records 20000] [--per-batch 100] [--json FILE]
+    python -m benchmarks.paper --only baseline
 
 The ordinary way: a robot adds each captured line to a stream of a Redis with a replica (XADD, WAIT 1; both fsync every
 write), and an anchorer reads the stream, keeps SHA-256 over what it has read, and writes that hash to the chain once a
@@ -11,14 +11,12 @@ says of itself. What each of the two gives stands in docs/evaluation.md.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -29,6 +27,7 @@ from eth_account.signers.local import LocalAccount
 from web3 import Web3
 
 import bridge_costs
+from geth_network import Unavailable
 from load import DURABLE
 from ports import free_port
 from rosbridge_eth.capture import Capture
@@ -36,11 +35,8 @@ from rosbridge_eth.ledger import Keyring
 from rosbridge_eth.ledger.nodes import EmbeddedChain
 
 STREAM = "records"
+PER_BATCH = 100
 SETTLED = 10.0  # seconds that a replica has to connect
-
-
-class Unavailable(Exception):
-    """redis-server is not installed."""
 
 
 @contextmanager
@@ -147,39 +143,9 @@ def bridge(records: int, per_batch: int) -> dict[str, float]:
     }  # fmt: skip
 
 
-def measure(quick: bool, records: int | None = None, per_batch: int = 100) -> dict[str, Any]:
+def measure(quick: bool) -> dict[str, Any]:
     """Both, one after the other; the figures of docs/evaluation.md."""
-    count = records or (500 if quick else 20_000)
+    records = 500 if quick else 20_000
     with tempfile.TemporaryDirectory() as folder:
-        plain = ordinary(Path(folder), count, per_batch)
-    return {"records": count, "per_batch": per_batch, "ordinary": plain, "bridge": bridge(count, per_batch)}
-
-
-def rows(found: dict[str, Any]) -> Sequence[tuple[str, ...]]:
-    """What was measured, as the rows of a table: what, the ordinary log, the bridge."""
-    named = (("robot, ms of processor a record", "robot_ms", ".4f"), ("server, ms a record", "server_ms", ".4f"),
-             ("gas a record", "gas", ",.0f"), ("bytes a record that are kept", "bytes", ".0f"),
-             ("records a second until they are durable", "records_per_second", ",.0f"))  # fmt: skip
-    return [(name, *(format(found[way][key], form) for way in ("ordinary", "bridge"))) for name, key, form in named]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--records", type=int, default=20_000)
-    parser.add_argument("--per-batch", type=int, default=100)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    try:
-        found = measure(False, options.records, options.per_batch)
-    except Unavailable as reason:
-        raise SystemExit(str(reason)) from None
-    print(f"| {options.per_batch} records to a batch and chunk | Redis Streams and anchor | the bridge |")
-    print("| --- | ---: | ---: |")
-    for row in rows(found):
-        print("| " + " | ".join(row) + " |")
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+        plain = ordinary(Path(folder), records, PER_BATCH)
+    return {"records": records, "per_batch": PER_BATCH, "ordinary": plain, "bridge": bridge(records, PER_BATCH)}

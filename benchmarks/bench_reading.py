@@ -26,7 +26,7 @@ from bridge_costs import POSE_AND_TWIST
 from rosbridge_eth.capture import Capture, TopicRule, parse_line, stream_line
 from rosbridge_eth.identity import Role, Trust, create_ca, enrol
 from rosbridge_eth.ledger.contract import DataEvent, RegistrationEvent, Standing
-from rosbridge_eth.log.chunk import Log, content_key, open_lines, robot_id, seal, verify_signature
+from rosbridge_eth.log.chunk import Chunk, Log, content_key, open_lines, robot_id, seal, verify_signature
 from rosbridge_eth.reading.memo import Memo
 from rosbridge_eth.reading.verify import Facts, Verifier
 from rosbridge_eth.robot.sources import BagSource, Selection, sample_bag
@@ -56,55 +56,61 @@ def main() -> None:
         proven(what, fields, arguments.chunks, arguments.records)
 
 
-def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None:
-    """What it costs to read and prove so many chunks of so many records."""
-    authority = create_ca("CA", at=START)
-    robot = enrol(authority, Role.ROBOT, NAME, at=START)
-    reader = enrol(authority, Role.READER, "owner", at=START).encryption_key
-    log, opening, lines = Log(LEDGER, robot_id(NAME)), *sample_lines(fields)
-    endless, previous, chunks = cycle(lines), bytes(32), []
-    for number in range(count):
-        content = (opening if number == 0 else []) + list(islice(endless, per_chunk))
-        chunk = seal(
-            log, robot.signing_key, content, stream=b"s" * 16, number=number, previous=previous,
-            sealed_ms=T0_MS + 1000 * number, readers=[reader.public_key], goodbye=number == count - 1,
-        )  # fmt: skip
-        previous = chunk.header.digest
-        chunks.append(chunk)
-    encoded = [chunk.encoded for chunk in chunks]
-    certificates = robot.public.certificates
-    standing = Standing(ACCOUNT, keccak(certificates), False, len(encoded), keccak(encoded[-1]), 0, 9, 1)
-    registered = [RegistrationEvent(ACCOUNT, certificates, 0, 0, 1, False)]
+class History:
+    """A robot's log of so many chunks of so many records, and its reader."""
 
-    def read(facts: Facts | None = None) -> int:
+    def __init__(self, fields: Sequence[str], count: int, per_chunk: int) -> None:
+        self._authority = create_ca("CA", at=START)
+        self.robot = enrol(self._authority, Role.ROBOT, NAME, at=START)
+        self.reader = enrol(self._authority, Role.READER, "owner", at=START).encryption_key
+        self.log, self.records = Log(LEDGER, robot_id(NAME)), count * per_chunk
+        opening, self.lines = sample_lines(fields)
+        endless, previous, self.chunks = cycle(self.lines), bytes(32), list[Chunk]()
+        for number in range(count):
+            content = (opening if number == 0 else []) + list(islice(endless, per_chunk))
+            chunk = seal(
+                self.log, self.robot.signing_key, content, stream=b"s" * 16, number=number, previous=previous,
+                sealed_ms=T0_MS + 1000 * number, readers=[self.reader.public_key], goodbye=number == count - 1,
+            )  # fmt: skip
+            previous = chunk.header.digest
+            self.chunks.append(chunk)
+
+    def read(self, facts: Facts | None = None) -> float:
+        """Read and prove all of it, eight chunks to a transaction; seconds of the processor."""
+        begin = time.process_time()
+        encoded, certificates = [chunk.encoded for chunk in self.chunks], self.robot.public.certificates
+        standing = Standing(ACCOUNT, keccak(certificates), False, len(encoded), keccak(encoded[-1]), 0, 9, 1)
         verifier = Verifier(
-            NAME, LEDGER, standing, registered, trust=Trust([authority.certificate]), reader=reader, block=9,
-            block_time=lambda block: T0_MS // 1000 + count, now=T0_MS / 1000, facts=facts,
+            NAME, LEDGER, standing, [RegistrationEvent(ACCOUNT, certificates, 0, 0, 1, False)],
+            trust=Trust([self._authority.certificate]), reader=self.reader, block=9,
+            block_time=lambda block: T0_MS // 1000 + len(encoded), now=T0_MS / 1000, facts=facts,
         )  # fmt: skip
         events = (DataEvent(at, 0, tuple(encoded[at : at + 8]), 9, b"", ACCOUNT) for at in range(0, len(encoded), 8))
         records = sum(1 for _ in verifier.read(events))
         verdict = verifier.verdict()
-        if not verdict.sound or records != count * per_chunk:
+        if not verdict.sound or records != self.records:
             raise SystemExit("\n".join(verdict.lines()))
-        return records
+        return time.process_time() - begin
 
+
+def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None:
+    """What it costs to read and prove so many chunks of so many records."""
+    history = History(fields, count, per_chunk)
+    log, robot, reader, chunks, records = history.log, history.robot, history.reader, history.chunks, history.records
+    encoded = [chunk.encoded for chunk in chunks]
     size = sum(map(len, encoded))
     machine = f"{platform.machine()}, Python {platform.python_version()}"
     print(f"{machine}: {len(encoded)} chunks of {per_chunk} records, {what}")
     print(f"{size / count / per_chunk:8.1f} bytes a record on the chain")
     for name in ("cold", "warm"):
-        begin = time.process_time()
-        records = read()
-        took = time.process_time() - begin
+        took = history.read()
         print(f"{records / took:8,.0f} records a second, {name}: {took / records * 1e6:.1f} us each, {took:.2f} s")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "facts.sqlite")
         for name in ("facts written", "facts read"):
-            begin = time.process_time()
             facts = Memo(file, reader)
-            read(facts)
+            took = history.read(facts)
             facts.close()
-            took = time.process_time() - begin
             print(f"{records / took:8,.0f} records a second, {name}: {took / records * 1e6:.1f} us each, {took:.2f} s")
         print(f"{file.stat().st_size / count:8.0f} bytes a chunk on the disk")
     for name, step in (
@@ -112,7 +118,7 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
         ("signature", lambda chunk: verify_signature(log, robot.signing_key.public_key, chunk)),
         ("content key", lambda chunk: content_key(chunk.header, reader)),
         ("content key, and opening", lambda chunk: open_lines(log, chunk, content_key(chunk.header, reader))),
-        ("parsing", lambda chunk: [parse_line(line) for line in lines[: per_chunk]]),
+        ("parsing", lambda chunk: [parse_line(line) for line in history.lines[: per_chunk]]),
     ):
         begin = time.process_time()
         for chunk in chunks[:200]:
@@ -120,7 +126,7 @@ def proven(what: str, fields: Sequence[str], count: int, per_chunk: int) -> None
         took = (time.process_time() - begin) / len(chunks[:200])
         print(f"{took * 1e6:8,.0f} us a chunk: {name}")
     tracemalloc.start()
-    read()
+    history.read()
     print(f"{tracemalloc.get_traced_memory()[1] / 2**20:8.1f} MiB at most while it reads")
     tracemalloc.stop()
 

@@ -33,7 +33,7 @@ _PASSWORD = "a node's own, on a machine that nobody else uses"
 
 
 class Unavailable(Exception):
-    """There is no geth that can make such blocks."""
+    """A program that a benchmark takes is not installed."""
 
 
 def find_geth(consensus: str = "clique") -> str:

@@ -1,6 +1,6 @@
 """How long a message takes from capture to the server's store and to the chain, through networks that lose and delay.
 
-    python benchmarks/latency.py [--messages 3000] [--pace 165] [--json FILE]
+    python -m benchmarks.paper --only latency
 
 One robot with everything real (source, capture, disk, channel), a server's shard as a process of its own, anvil with
 a block for what is written at once and one confirmation, and between robot and server a relay that loses and delays
@@ -11,9 +11,7 @@ least there can be on average.
 
 from __future__ import annotations
 
-import argparse
 import heapq
-import json
 import multiprocessing
 import random
 import select
@@ -168,42 +166,21 @@ def _spread(handed_out: Sequence[float], chunks: Sequence[Chunk], times: Sequenc
     return sorted(at - begun for begun, at in zip(handed_out, records[OPENING:], strict=True))
 
 
-def measure(quick: bool, messages: int | None = None, pace: float = 165.0) -> dict[str, Any]:
+def measure(quick: bool) -> dict[str, Any]:
     """Both distributions in seconds, for every network."""
-    count, networks = messages or (165 if quick else 3000), NETWORKS[:2] if quick else NETWORKS
+    count, networks = 165 if quick else 3000, NETWORKS[:2] if quick else NETWORKS
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         operator = load.Operator(Path(folder), "anvil", "sqlite", len(networks), lambda text: None)
         try:
             for robot, (loss, delay) in zip(operator.robots, networks, strict=True):
-                stored, confirmed = through(operator, robot, loss, delay, count, pace)
+                stored, confirmed = through(operator, robot, loss, delay, count, bridge_costs.PACE)
                 rows.append({"loss": loss, "delay": delay, "stored": figures(stored), "confirmed": figures(confirmed)})
         finally:
             operator.close()
-    return {"messages": count, "pace": pace, "rows": rows}
+    return {"messages": count, "pace": bridge_costs.PACE, "rows": rows}
 
 
 def figures(ordered: Sequence[float]) -> dict[str, float]:
     named = {name: ordered[int(share * (len(ordered) - 1))] for name, share in SHARES}
     return named | {"mean": statistics.fmean(ordered)}
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--messages", type=int, default=3000)
-    parser.add_argument("--pace", type=float, default=165.0, help="messages a second")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    found = measure(False, options.messages, options.pace)
-    print("| loss each way | round trip, ms | until | " + " | ".join(name for name, _ in SHARES) + " | mean |")
-    print("| ---: | ---: | --- |" + " ---: |" * (len(SHARES) + 1))
-    for row in found["rows"]:
-        for what in ("stored", "confirmed"):
-            cells = " | ".join(f"{seconds:.2f}" for seconds in row[what].values())
-            print(f"| {row['loss']:.0%} | {2000 * row['delay']:.0f} | {what} | {cells} |")
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,11 @@
 """Many robots at once: from their handshakes to the chain, each stage counted and timed.
 
-    python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--per-chunk 1]
-                              [--store sqlite|redis|URL] [--chain anvil|embedded|clique] [--shards 1] [--json FILE]
+    python benchmarks/load.py [--sessions 300 500 700] [--messages 10] [--per-chunk 1] [--pace 0]
+                              [--store sqlite redis] [--shards 1 2 4] [--runs 3]
+                              [--chain anvil|embedded|clique] [--json FILE]
+
+Each store is tried with each number of shards and of sessions. Printed are all counts, and for each of them a line with
+messages a second and what limits them.
 
 The paper's blockchain end received 2,994, 4,986 and 6,991 messages of 300, 500
 and 700 clients that sent 10 each, and so lost 0.23 % (Security and
@@ -18,17 +22,21 @@ opened with the reader's key, and its messages compared with those captured.
 
 All robots of a run begin at the same moment, from one address: the worst case.
 They send when all sessions stand, so that handshakes and chunks are timed
-apart.
+apart: everything at once, or with --pace so many messages a second each, as
+robots do.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import logging
+import math
 import multiprocessing
 import os
 import platform
+import random
 import resource
 import secrets
 import select
@@ -36,6 +44,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
@@ -82,19 +91,33 @@ from rosbridge_eth.server import reception as door
 from rosbridge_eth.server.reception import Worker
 from rosbridge_eth.server.shard import Shard, open_reception, open_store, open_submitter
 from smcrypto import sm2
+from spread import across, point
 
 TOPIC = "/robot_1/odom"
-PAPER = {300: 2994, 500: 4986, 700: 6991}
 FORK = multiprocessing.get_context("fork")
 RICH = 100_000
 SETTLING = 180.0
+BUSY = 0.9  # of the cores there are: from here on they are what limits
 MIB = 1 << 20
 DURABLE = ("--appendonly", "yes", "--appendfsync", "always", "--maxmemory-policy", "noeviction", "--save", "")
 
 
 @dataclass
+class Use:
+    """How many cores were busy during a span, and by whom. rest: the node, Redis, the kernel, whatever else runs."""
+
+    shards: float = 0.0
+    submitters: float = 0.0
+    robots: float = 0.0
+    rest: float = 0.0
+
+
+@dataclass
 class Figures:
-    """What one run counted. Seconds, unless the name says otherwise; processor time is the server's own."""
+    """What one run counted. Seconds, unless the name says otherwise; processor time is the server's own.
+
+    pace: messages a second of each robot, 0: all at once.
+    """
 
     sessions: int
     messages: int
@@ -102,6 +125,7 @@ class Figures:
     store: str
     chain: str
     shards: int
+    pace: float = 0.0
     load_average: float = 0.0
     established: int = 0
     sent: int = 0
@@ -129,6 +153,9 @@ class Figures:
     dropped: dict[str, int] = field(default_factory=dict)
     shard_mib: list[float] = field(default_factory=list)
     growth_kib_per_session: float = 0.0
+    idle_cpu_ms: float = 0.0  # a session and second in which nothing is said; measured where `idle` is given
+    storing: Use = field(default_factory=Use)
+    writing: Use = field(default_factory=Use)
 
 
 # --- the operator: a home, a chain, a contract, robots
@@ -219,10 +246,12 @@ class Operator:
         on_stage(f"{robots} robots: keys, certificates, accounts, registrations in the contract")
         ca = load_ca(self.home.ca, self.passphrase, now)
         registrar = Unwaited(where, self.deployment, keys.operator.address) if keys is not None else self.ledger
+        started = time.perf_counter()
         self.robots = [self._register(registrar, ca, f"robot_{number}", now) for number in range(1, robots + 1)]
         if isinstance(registrar, Unwaited):
             registrar.settle()
             registrar.close()
+        self.registering_ms = (time.perf_counter() - started) / robots * 1000
         self.sealed: dict[bytes, bytes] = {}
         """By digest, the chunks of all runs."""
         self.spools = folder / "spools"
@@ -354,12 +383,21 @@ def peak_kib() -> int:
     return _status_kib("VmHWM") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+TICK = os.sysconf("SC_CLK_TCK")
+
+
 def cpu_seconds(pids: Sequence[int]) -> float:
     total = 0.0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        total += (int(fields[11]) + int(fields[12])) / TICK
     return total
+
+
+def busy_seconds() -> float:
+    """Of all cores of this machine, since it started; idle and waiting for a disk are the fourth and fifth figure."""
+    fields = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+    return (sum(fields) - fields[3] - fields[4]) / TICK
 
 
 # --- the robots' end
@@ -405,6 +443,7 @@ class Session:
             operator.spools / f"{robot.name}.sqlite", place, max_bytes=64 * MIB, drop=partial(drop, place, key)
         )
         self._chunks: list[Chunk] = []
+        self._every, self._due = 0.0, math.inf
 
     def seal(self, messages: int, per_chunk: int) -> dict[bytes, bytes]:
         self._writer = LogWriter(
@@ -422,10 +461,16 @@ class Session:
         self.sock, address = client_socket(self._server)
         self.client.connect(address, now)
 
-    def begin(self) -> None:
-        """What was sealed is there to be sent from now on."""
-        for chunk in self._chunks:
-            self.spool.append(chunk)
+    def begin(self, every: float = 0.0) -> None:
+        """What was sealed is there to be sent from now on: all of it, or a chunk every so many seconds."""
+        self._every, self._due = every, time.monotonic() + random.random() * every
+        if not every:
+            self._append(math.inf)
+
+    def _append(self, now: float) -> None:
+        while self._chunks and self._due <= now:
+            self.spool.append(self._chunks.pop(0))
+            self._due += self._every
 
     def turn(self, now: float, *, readable: bool) -> float:
         """Do what there is to do; when to be called again at the latest."""
@@ -440,10 +485,11 @@ class Session:
         client.handle_timer(now)
         while (event := client.next_event()) is not None:
             self.sender.handle(event, now)
+        self._append(now)
         self.sender.send(now)
         for data, place in client.datagrams_to_send(now):
             self.sock.sendto(data, place)
-        return client.next_timer() or now + 1
+        return min(client.next_timer() or now + 1, self._due if self._chunks else math.inf)
 
     @property
     def connected(self) -> bool:
@@ -452,12 +498,12 @@ class Session:
     @property
     def stored(self) -> bool:
         """The server has everything."""
-        return self.sender.idle
+        return not self._chunks and self.sender.idle
 
     @property
     def confirmed(self) -> bool:
         """Everything is on the chain, as the server says."""
-        return self.spool.statistics().chunks == 0
+        return not self._chunks and self.spool.statistics().chunks == 0
 
     def close(self) -> None:
         self.spool.close()
@@ -466,7 +512,7 @@ class Session:
 
 def client_process(
     operator: Operator, robots: Sequence[Identity], servers: Sequence[tuple[str, int]], messages: int, per_chunk: int,
-    report: Connection, limit: float,
+    report: Connection, limit: float, every: float,
 ) -> None:
     """Several robots in one process. It reports after each phase and waits for the word to go on."""
     logging.getLogger("rosbridge_eth").setLevel(logging.ERROR)  # that a session takes long is in the figures
@@ -483,7 +529,7 @@ def client_process(
     drive(sessions, lambda session: False, limit, report)
     report.recv()
     for session in sessions:
-        session.begin()
+        session.begin(every)
     report.send("begun")
     drive(sessions, lambda session: session.stored, limit)
     report.send(sum(session.spool.statistics().unstored for session in sessions))
@@ -545,12 +591,22 @@ def _processes() -> Iterator[Callable[..., tuple[Any, Connection]]]:
             process.join()
 
 
+def _use(before: Sequence[float], after: Sequence[float]) -> Use:
+    """Cores between two readings of the clock, the machine, the shards, of them the submitters, and the robots."""
+    clock, machine, shards, submitters, robots = (b - a for a, b in zip(before, after, strict=True))
+    rest = machine - shards - robots
+    return Use((shards - submitters) / clock, submitters / clock, robots / clock, rest / clock)
+
+
 def run(
     operator: Operator, sessions: int, messages: int, *, per_chunk: int = 1, shards: int = 1, clients: int = 2,
-    limit: float = 240.0, on_stage: Callable[[str], None] = lambda text: None,
+    pace: float = 0.0, idle: float = 0.0, limit: float = 240.0, on_stage: Callable[[str], None] = lambda text: None,
 ) -> Figures:
-    """One run with the first `sessions` robots of `operator`; `limit` is for each phase, in seconds."""
-    figures = Figures(sessions, messages, per_chunk, operator.store_kind, operator.chain_kind, shards)
+    """One run with the first `sessions` robots of `operator`; `limit` is for each phase, in seconds.
+
+    pace: messages a second of each robot, 0: all at once. idle: seconds in which the sessions stand and say nothing.
+    """
+    figures = Figures(sessions, messages, per_chunk, operator.store_kind, operator.chain_kind, shards, pace)
     figures.load_average, figures.sent = os.getloadavg()[0], sessions * messages
     robots = operator.robots[:sessions]
     sockets = [server_socket(Address("127.0.0.1", 0)) for _ in range(shards)]
@@ -562,9 +618,17 @@ def run(
         pids = [process.pid for process, _ in serving]
 
         def client(own: Sequence[Identity], pipe: Connection) -> None:
-            client_process(operator, own, addresses, messages, per_chunk, pipe, limit)
+            every = per_chunk / pace if pace else 0.0
+            client_process(operator, own, addresses, messages, per_chunk, pipe, limit, every)
 
-        ends = [start(client, robots[n::clients])[1] for n in range(clients)]
+        driving = [start(client, robots[n::clients]) for n in range(clients)]
+        ends = [pipe for _, pipe in driving]
+
+        def used() -> list[float]:
+            """Seconds so far: the clock's, the machine's, the shards', of them the submitters', the robots'."""
+            return [time.perf_counter(), busy_seconds(), cpu_seconds(pids), sum(each.value for each in submitted),
+                    cpu_seconds([process.pid for process, _ in driving])]  # fmt: skip
+
         on_stage(f"{sessions} robots seal {messages} messages each")
         sealed: dict[bytes, bytes] = {}
         for pipe in ends:
@@ -580,20 +644,26 @@ def run(
         figures.connecting = time.perf_counter() - started
         figures.handshake_cpu_ms = (cpu_seconds(pids) - cpu) / max(1, figures.established) * 1000
 
+        if idle:
+            on_stage(f"{idle:.0f} s of silence")
+            before_it = used()
+            time.sleep(idle)
+            figures.idle_cpu_ms = _use(before_it, used()).shards / sessions * 1000
+
         on_stage("messages")
         cpu, before = cpu_seconds(pids), sum(each.value for each in submitted)
         for pipe in ends:
             pipe.send("send")
         for pipe in ends:
             pipe.recv()
-        started = time.perf_counter()
+        started, begun = time.perf_counter(), used()
         figures.stored = figures.chunks - sum(pipe.recv() for pipe in ends)
-        figures.sending = time.perf_counter() - started
+        figures.sending, figures.storing = time.perf_counter() - started, _use(begun, used())
         writing = sum(each.value for each in submitted) - before
         figures.message_cpu_ms = (cpu_seconds(pids) - cpu - writing) / figures.sent * 1000
         on_stage("the chain")
         reports = [pipe.recv() for pipe in ends]
-        figures.to_chain = time.perf_counter() - started
+        figures.to_chain, figures.writing = time.perf_counter() - started, _use(begun, used())
         figures.submitter_cpu_ms = (sum(each.value for each in submitted) - before) / figures.sent * 1000
         for pipe in ends:
             pipe.send("end")
@@ -634,41 +704,74 @@ def run(
 # --- printing
 
 
-def rows(figures: Figures) -> list[tuple[str, str]]:
-    f = figures
-    paper = PAPER.get(f.sessions) if f.messages == 10 else None
-    return [
-        ("sessions established", f"{f.established} of {f.sessions}"),
-        ("sessions a second, all at once", f"{f.established / f.connecting:.0f}"),
-        ("server's processor time a handshake", f"{f.handshake_cpu_ms:.2f} ms"),
-        ("messages sent, in chunks", f"{f.sent} in {f.chunks}"),
-        ("chunks acknowledged as stored", f"{f.stored}"),
-        ("chunks read back from the chain", f"{f.on_chain}"),
-        ("messages proven, opened and equal", f"{f.equal}"),
-        ("**lost / doubled / altered**", f"**{f.lost} / {f.doubled} / {f.altered}**"),
-        ("the paper: reached its server", f"{paper:,} ({(1 - paper / f.sent):.2%} lost)" if paper else "–"),
-        ("messages a second into the store", f"{f.sent / f.sending:.0f}"),
-        ("server's processor time a message, to the store", f"{f.message_cpu_ms:.3f} ms"),
-        ("of it decrypting the channel", f"{f.opening_ms / max(1, f.opened):.3f} ms a packet, {f.opening_ms:.0f} ms"),
-        ("of it verifying signatures",
-         f"{f.verifying_ms / max(1, f.verified):.3f} ms a chunk, {f.verifying_ms:.0f} ms"),
-        ("submitter's processor time a message", f"{f.submitter_cpu_ms:.3f} ms"),
-        ("first message to last confirmation at a robot", f"{f.to_chain:.1f} s, {f.batches} transactions"),
-        ("peak memory of each shard", ", ".join(f"{mib:.0f} MiB" for mib in f.shard_mib)),
-        ("of it a session", f"{f.growth_kib_per_session:.1f} KiB"),
-        ("packets sent again / sessions made again", f"{f.retransmitted} / {f.reconnected}"),
-        ("datagrams dropped by the server", ", ".join(f"{n} {why}" for why, n in f.dropped.items()) or "none"),
+def per_packet(f: Figures) -> float:
+    return f.opening_ms / max(1, f.opened)
+
+
+def table(runs: Sequence[Sequence[Figures]]) -> str:
+    """Every count of one load or several, each with its runs."""
+    numbers: list[tuple[str, Callable[[Figures], float], str]] = [
+        ("sessions established", lambda f: f.established, ",.0f"),
+        ("sessions a second, all at once", lambda f: f.established / f.connecting, ".0f"),
+        ("server, ms a handshake", lambda f: f.handshake_cpu_ms, ".2f"),
+        ("messages sent", lambda f: f.sent, ",.0f"),
+        ("chunks", lambda f: f.chunks, ",.0f"),
+        ("chunks acknowledged as stored", lambda f: f.stored, ",.0f"),
+        ("chunks read back from the chain", lambda f: f.on_chain, ",.0f"),
+        ("messages proven, opened and equal", lambda f: f.equal, ",.0f"),
+        ("lost", lambda f: f.lost, ",.0f"),
+        ("doubled", lambda f: f.doubled, ",.0f"),
+        ("altered", lambda f: f.altered, ",.0f"),
+        ("server, ms a message, to the store", lambda f: f.message_cpu_ms, ".3f"),
+        ("decrypting the channel, ms a packet", per_packet, ".3f"),
+        ("decrypting the channel, ms in all", lambda f: f.opening_ms, ".0f"),
+        ("verifying, ms a chunk", lambda f: f.verifying_ms / max(1, f.verified), ".3f"),
+        ("submitter, ms a message", lambda f: f.submitter_cpu_ms, ".3f"),
+        ("first message to last confirmation, s", lambda f: f.to_chain, ".1f"),
+        ("transactions", lambda f: f.batches, ",.0f"),
+        ("memory of the largest shard, MiB", lambda f: max(f.shard_mib), ".0f"),
+        ("memory a session, KiB", lambda f: f.growth_kib_per_session, ".0f"),
+        ("packets sent again", lambda f: f.retransmitted, ",.0f"),
+        ("sessions made again", lambda f: f.reconnected, ",.0f"),
+        ("datagrams that the server dropped", lambda f: sum(f.dropped.values()), ",.0f"),
     ]  # fmt: skip
-
-
-def table(results: Sequence[Figures]) -> str:
-    columns = [rows(figures) for figures in results]
-    lines = ["| | " + " | ".join(f"{f.sessions} × {f.messages}, {f.store}" for f in results) + " |",
-             "| --- |" + " ---: |" * len(results)]
+    lines = ["| | " + " | ".join(title(one[0]) for one in runs) + " |", "| --- |" + " ---: |" * len(runs)]
     lines += [
-        f"| {cells[0][0]} | " + " | ".join(value for _, value in cells) + " |"
-        for cells in zip(*columns, strict=True)
+        f"| {name} | " + " | ".join(across(one, figure).say(form) for one in runs) + " |"
+        for name, figure, form in numbers
     ]
+    return "\n".join(lines)
+
+
+def title(f: Figures) -> str:
+    paced = f", {f.pace:g} a second each" if f.pace else ""
+    return f"{f.store}, {f.shards} shard{'s' * (f.shards > 1)}, {f.sessions} × {f.messages}{paced}"
+
+
+def limit_of(runs: Sequence[Figures], use: Callable[[Figures], Use]) -> str:
+    """What a load waited for: its own pace, the machine, a core of each shard, or none of them."""
+    cores, shards = os.cpu_count() or 1, runs[0].shards
+    parts = [across(runs, lambda f, part=part: getattr(use(f), part)).median  # type: ignore[misc]
+             for part in ("shards", "submitters", "robots", "rest")]  # fmt: skip
+    shares = f"shards {parts[0]:.1f}, submitters {parts[1]:.1f}, robots {parts[2]:.1f}, node and rest {parts[3]:.1f}"
+    if runs[0].pace:
+        return f"the robots' pace; {sum(parts):.1f} of {cores} cores busy: {shares}"
+    if sum(parts) >= BUSY * cores:
+        return f"the machine's {cores} cores: {shares}"
+    if parts[0] + parts[1] >= BUSY * shards:
+        return f"one core a shard: {shares}"
+    return f"waiting for disks, store or blocks; {sum(parts):.1f} of {cores} cores busy: {shares}"
+
+
+def limits(runs: Sequence[Sequence[Figures]]) -> str:
+    """A line for each load: messages a second into the store and onto the chain, and what limits each."""
+    lines = ["| | messages a second, stored | limited by | confirmed on the chain | limited by |",
+             "| --- | ---: | --- | ---: | --- |"]  # fmt: skip
+    for one in runs:
+        stored, confirmed = (across(one, figure).say(",.0f") for figure in
+                             (lambda f: f.sent / f.sending, lambda f: f.sent / f.to_chain))  # fmt: skip
+        lines.append(f"| {title(one[0])} | {stored} | {limit_of(one, lambda f: f.storing)} | {confirmed}"
+                     f" | {limit_of(one, lambda f: f.writing)} |")  # fmt: skip
     return "\n".join(lines)
 
 
@@ -686,8 +789,10 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, nargs="+", default=[300, 500, 700])
     parser.add_argument("--messages", type=int, default=10)
     parser.add_argument("--per-chunk", type=int, default=1, help="messages in a chunk")
-    parser.add_argument("--shards", type=int, default=1)
-    parser.add_argument("--store", default="sqlite", help="sqlite, redis (started here) or the URL of one")
+    parser.add_argument("--pace", type=float, default=0.0, help="messages a second of each robot; 0: all at once")
+    parser.add_argument("--shards", type=int, nargs="+", default=[1])
+    parser.add_argument("--store", nargs="+", default=["sqlite"], help="sqlite, redis (started here) or a URL of one")
+    parser.add_argument("--runs", type=int, default=1, help="of each; shown are the median, the lowest and the highest")
     parser.add_argument("--chain", choices=["anvil", "embedded", "clique"],
                         default="anvil" if shutil.which("npx") or shutil.which("anvil") else "embedded")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
@@ -695,25 +800,31 @@ def main() -> None:
     began = time.perf_counter()
 
     def say(text: str) -> None:
-        print(f"{time.perf_counter() - began:6.1f} s  {text}", flush=True)
+        print(f"{time.perf_counter() - began:6.1f} s  {text}", file=sys.stderr, flush=True)
 
-    results = []
-    with tempfile.TemporaryDirectory() as folder:
-        operator = Operator(Path(folder), options.chain, options.store, max(options.sessions), say)
-        try:
-            for count in options.sessions:
-                results.append(run(operator, count, options.messages, per_chunk=options.per_chunk,
-                                   shards=options.shards, on_stage=say))
-        finally:
-            operator.close()
-    loads = ", ".join(f"{figures.load_average:.1f}" for figures in results)
-    print(f"\n{processor()}, Python {platform.python_version()}, load average before each run {loads};"
-          f" {options.shards} shards, {options.chain}\n\n{table(results)}")
+    results: list[list[Figures]] = []
+    for store in options.store:
+        with tempfile.TemporaryDirectory() as folder:
+            operator = Operator(Path(folder), options.chain, store, max(options.sessions), say)
+            try:
+                for shards, count in itertools.product(options.shards, options.sessions):
+                    say(f"{store}, {shards} shards, {count} robots")
+                    results.append([
+                        run(operator, count, options.messages, per_chunk=options.per_chunk, shards=shards,
+                            pace=options.pace, on_stage=say)
+                        for _ in range(options.runs)
+                    ])  # fmt: skip
+            finally:
+                operator.close()
+    every = [figures for one in results for figures in one]
+    loads = point([figures.load_average for figures in every]).say(".1f")
+    print(f"{processor()}, Python {platform.python_version()}, load average before a run {loads}; {options.chain}; runs"
+          f" of each: {options.runs}, shown as median (lowest–highest)\n\n{table(results)}\n\n{limits(results)}")
     if options.json:
-        options.json.write_text(json.dumps([asdict(figures) for figures in results], indent=1))
-    for figures in results:
-        print(*figures.unsound, sep="\n")
-    if any(f.lost or f.doubled or f.altered or f.unsound or f.equal != f.sent for f in results):
+        options.json.write_text(json.dumps([[asdict(figures) for figures in one] for one in results], indent=1))
+    for finding in itertools.chain.from_iterable(figures.unsound for figures in every):
+        print(finding)
+    if any(f.lost or f.doubled or f.altered or f.unsound or f.equal != f.sent for f in every):
         raise SystemExit("records were lost, doubled or altered")
 
 

@@ -1,12 +1,15 @@
 """The paper's evaluation, done again: its tables and figures, with this implementation's rows beside the paper's.
 
-    python benchmarks/paper.py [--quick] [--only PART ...] [--dag FOLDER] [--out FOLDER]
+    python -m benchmarks.paper [--runs 3] [--quick] [--only PART ...] [--dag FOLDER] [--out FOLDER]
 
 Writes evaluation.json, evaluation.md and the pictures evaluation-*.svg into FOLDER (docs). Each part keeps its figures
-in the JSON file, so that parts can be measured one by one; the page and the pictures are made of what is there.
+in the JSON file, so that parts can be measured one by one; the page and the pictures are made of what is there. Every
+point of a table or picture is the median of the runs, with the lowest and the highest of them.
 
-    user         10,000 messages in sequence at the user end, stage by stage (the paper's Table 3 and Figure 12)
-    server       300, 500 and 700 clients, 10 messages each, onto three nodes by proof of authority (Table 4, Figure 13)
+    user         10,000 messages in sequence at the user end, stage by stage (the paper's Table 3 and Figure 12), and a
+                 robot at its real pace
+    server       300, 500 and 700 clients, 10 messages each, onto three nodes by proof of authority (Table 4, Figure
+                 13), and 200 robots at their real pace
     poa, pow     every client registers once, writes four times and asks four times, by number of clients
     bridge-poa   from `init` to a proven read, four robots as in the paper
     bridge-pow   the same by proof of work, and a reorganisation by two miners that were cut from each other
@@ -14,7 +17,8 @@ in the JSON file, so that parts can be measured one by one; the page and the pic
     baseline     the same records into an ordinary replicated log with an anchor on the chain (baseline.py)
     scale        the model of scale.py, with the costs that are measured here
 
---quick: few messages and clients, the load on anvil, and nothing by proof of work: what continuous integration runs.
+--quick: one run of few messages and clients, the load on anvil, and nothing by proof of work, into a folder of its own:
+what continuous integration runs. What each part ran on is printed, and stands on the page.
 The paper's figures are those of Security and Communication Networks 2022, article 7206494. By proof of work nodes take
 ethash's dataset of 1 GB, which is made in FOLDER of --dag if it is not there: 20 minutes of a busy core.
 """
@@ -22,6 +26,7 @@ ethash's dataset of 1 GB, which is made in FOLDER of --dag if it is not there: 2
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import logging
 import os
@@ -37,6 +42,8 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+sys.path.append(str(Path(__file__).parent))  # for `python -m benchmarks.paper`
 
 import baseline
 import bridge_costs
@@ -55,6 +62,8 @@ from rosbridge_eth.server.submitter import Submitter
 PER_BUCKET = 100  # messages that share a point of the picture
 CONFIRMATIONS = {"poa": 3, "pow": 12}
 DEPTH = 6  # blocks that the reorganisation takes back, at least
+
+CLIQUE, ETHASH = "three nodes of geth 1.13 with Clique", "three nodes of geth 1.10 with ethash"
 
 Part = dict[str, Any]
 
@@ -108,7 +117,15 @@ def user_end(quick: bool) -> Part:
     with tempfile.TemporaryDirectory() as folder:
         rate, per_chunk_, stored, _ = bridge_costs.throughput(who, Path(folder), messages, False)
     opening = 2  # lines of the stream that are no messages: what it is from, and the type's definition
-    return part | {"rate": rate, "per_chunk": per_chunk_, "delivered": stored - opening}
+    seconds = 1 if quick else 20
+    with tempfile.TemporaryDirectory() as folder:
+        _, paced_chunk, _, paced = bridge_costs.throughput(
+            who, Path(folder), int(seconds * bridge_costs.PACE), False, pace=bridge_costs.PACE
+        )
+    return part | {
+        "rate": rate, "per_chunk": per_chunk_, "delivered": stored - opening, "on": "no chain",
+        "paced": {"pace": bridge_costs.PACE, "per_chunk": paced_chunk, "ms": paced},
+    }  # fmt: skip
 
 
 def spread(calls: Sequence[float], messages: int) -> list[float]:
@@ -118,22 +135,25 @@ def spread(calls: Sequence[float], messages: int) -> list[float]:
 
 
 def server_end(quick: bool) -> Part:
-    """The load of the paper's clients, through the real server onto three nodes by proof of authority."""
+    """The load of the paper's clients, through the real server onto three nodes by proof of authority; and of robots
+    at their real pace, 10 messages a second and a chunk a second each."""
     counts, messages = ([10], 3) if quick else ([300, 500, 700], 10)
+    robots, paced_messages = (4, 20) if quick else (200, 300)
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         operator = load.Operator(Path(folder), "anvil" if quick else "clique", "sqlite", max(counts), say)
         try:
             for count in counts:
                 runs.append(asdict(load.run(operator, count, messages, on_stage=say)))
+            paced = load.run(operator, robots, paced_messages, per_chunk=10, pace=10.0, on_stage=say)
         finally:
             operator.close()
-    return {"runs": runs}
+    return {"runs": runs, "paced": asdict(paced), "on": "anvil" if quick else CLIQUE}
 
 
 def interaction(kind: str, quick: bool, dag: Path | None) -> Part:
     """The response times of registration, writing and querying, by number of clients."""
-    part = Part(runs=[])
+    part = Part(runs=[], on=CLIQUE if dag is None else ETHASH)
     periods = {"poa": [1] if quick else [1, 20], "pow": [0]}[kind]
     for period in periods:
         counts = [4] if quick else [100] if period == 20 else [10, 30, 100]
@@ -167,7 +187,9 @@ def bridge(kind: str, quick: bool, dag: Path | None) -> Part:
             run = load.run(operator, 4, messages, per_chunk=10, limit=1200.0, on_stage=say)
         finally:
             operator.close()
-    part = Part(run=asdict(run), ready=ready, confirmations=CONFIRMATIONS[kind])
+    part = Part(
+        run=asdict(run), ready=ready, confirmations=CONFIRMATIONS[kind], on=CLIQUE if dag is None else ETHASH
+    )
     return part if dag is None else part | {"reorganisation": reorganisation(dag)}
 
 
@@ -252,20 +274,25 @@ def say(text: str) -> None:
 
 
 def machine() -> dict[str, Any]:
-    return {"processor": load.processor(), "python": platform.python_version(), "load": round(os.getloadavg()[0], 1)}
+    fast = all(importlib.util.find_spec(name) for name in ("cryptography", "gmpy2"))  # the extra [fast]
+    return {"processor": load.processor(), "python": platform.python_version(), "fast": fast,
+            "load": round(os.getloadavg()[0], 1)}  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--runs", type=int, help="of each part; 3, with --quick 1")
     parser.add_argument("--only", nargs="*", metavar="PART", help="measure these; none: only make page and pictures")
     parser.add_argument("--dag", type=Path, default=Path(".dag"))
-    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent.parent / "docs")
+    parser.add_argument("--out", type=Path, help="docs; with --quick evaluation-quick in the folder of temporary files")
     options = parser.parse_args()
+    docs = Path(__file__).resolve().parent.parent / "docs"
+    options.out = options.out or (Path(tempfile.gettempdir()) / "evaluation-quick" if options.quick else docs)
     logging.getLogger("rosbridge_eth").setLevel(logging.ERROR)
     file = options.out / "evaluation.json"
     figures: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-    quick, dag = options.quick, options.dag
+    quick, dag, runs = options.quick, options.dag, options.runs or (1 if options.quick else 3)
     parts: Mapping[str, Callable[[], Part]] = {
         "user": lambda: user_end(quick),
         "server": lambda: server_end(quick),
@@ -273,9 +300,9 @@ def main() -> None:
         "bridge-poa": lambda: bridge("poa", quick, None),
         "pow": lambda: interaction("pow", quick, dag),
         "bridge-pow": lambda: bridge("pow", quick, dag),
-        "latency": lambda: latency.measure(quick),
-        "baseline": lambda: baseline.measure(quick),
-        "scale": lambda: scale.measure(quick),
+        "latency": lambda: latency.measure(quick) | {"on": "anvil"},
+        "baseline": lambda: baseline.measure(quick) | {"on": "the embedded chain"},
+        "scale": lambda: scale.measure(quick) | {"on": "anvil"},
     }
     wanted = options.only if options.only is not None else [name for name in parts if not (quick and "pow" in name)]
     if unknown := set(wanted) - set(parts):
@@ -286,16 +313,20 @@ def main() -> None:
             say("ethash's dataset")
             geth_network.make_dag(dag)
         for name in wanted:
-            say(f"part {name}")
-            began = time.monotonic()
-            figures[name] = {"quick": quick, "machine": machine()} | parts[name]()
-            figures[name]["seconds"] = time.monotonic() - began
+            before, began = machine(), time.monotonic()
+            measured = []
+            for number in range(runs):
+                say(f"part {name}, run {number + 1} of {runs}")
+                measured.append(parts[name]())
+            figures[name] = {"quick": quick, "edition": paper_page.EDITION, "machine": before,
+                             "seconds": time.monotonic() - began, "measured": measured}  # fmt: skip
             file.write_text(json.dumps(figures, indent=1) + "\n")
     except geth_network.Unavailable as reason:
         raise SystemExit(str(reason)) from None
     for picture in paper_page.draw(figures, options.out):
         say(f"{picture}")
     (options.out / "evaluation.md").write_text(paper_page.page(figures))
+    print(f"{options.out / 'evaluation.md'}\n\n{paper_page.ran_on(figures)}")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 One small change at a time (a comparison, an operator, a number, a condition, a statement left out) is made to a copy of
 the package, and the tests of the changed module run against it until the first fails. A change that no test
-notices *survives*: a test is missing, or the change makes no difference that can be seen. docs/mutation.md keeps the
-sample that was run, and a judgement on each survivor.
+notices *survives*: a test is missing, or the change makes no difference that can be seen. CONTRIBUTING.md
+says what the last samples gave.
 
     nice -n 10 python fuzz/mutate.py --sample 45 --seed 1 [--only sm3] [--report FILE]
     nice -n 10 python fuzz/mutate.py --sample 120 --seed 2 --only all

@@ -1,9 +1,7 @@
 """The documents and docstrings of smcrypto, run as they are written; links; and the README's two commands.
 
 Examples under one heading of a page belong together: they run in order, Python in
-one namespace, shell commands in one folder. Examples that show another library
-beside ours need it installed, and skip where it is not. The page on the fleet's CA
-has a test of its own.
+one namespace, shell commands in one folder. The page on the fleet's CA has a test of its own.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from conftest import unavailable
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-EXAMPLES = [ROOT / "README.md", ROOT / "PACKAGE.md", DOCS / "smcrypto.md", DOCS / "migration.md", DOCS / "security.md",
+EXAMPLES = [ROOT / "README.md", ROOT / "PACKAGE.md", DOCS / "smcrypto.md", DOCS / "security.md",
             ROOT / "README.zh.md", DOCS / "zh" / "quickstart.md"]  # fmt: skip
 PAGES = sorted([ROOT / "README.md", ROOT / "README.zh.md", ROOT / "PACKAGE.md", ROOT / "CHANGELOG.md",
                 ROOT / "SECURITY.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md"), *(ROOT / "tests").rglob("*.md")])

@@ -31,7 +31,7 @@ def test_every_record_of_many_robots_is_on_the_chain_once(
         figures = load.run(operator, SESSIONS, MESSAGES, per_chunk=per_chunk, limit=120)
     finally:
         operator.close()
-    print(load.table([figures]))
+    print(load.table([[figures]]))
     assert figures.established == SESSIONS
     assert figures.chunks == figures.stored == figures.on_chain == SESSIONS * MESSAGES / per_chunk
     assert figures.equal == SESSIONS * MESSAGES

@@ -231,7 +231,7 @@ def _forget_two_levels_down(reader: der.Reader) -> None:
     "forget", [_forget_and_go_on, _forget_and_open_the_next, _forget_at_the_end, _forget_two_levels_down]
 )
 def test_no_parser_can_forget_what_is_left_inside_a_value(forget: Callable[[der.Reader], None]) -> None:
-    """Two of the changes of docs/mutation.md that no test noticed were a forgotten check for what is left over."""
+    """Two of the changes of fuzz/mutate.py that no test noticed were a forgotten check for what is left over."""
     data = {
         _forget_and_go_on: der.sequence(der.integer(1), der.null()) + der.null(),
         _forget_and_open_the_next: der.sequence(der.integer(1)) + der.sequence(),

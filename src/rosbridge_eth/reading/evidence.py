@@ -17,7 +17,7 @@ import json
 import re
 from base64 import b64encode
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from importlib import resources
 from itertools import pairwise
@@ -174,33 +174,32 @@ class Statement(NamedTuple):
 
     def proves(self, asked: Asked | None = None) -> Iterator[str]:
         """asked: what a node has said of it."""
-        sealed = [one.place.sealed_ms * 10**6 for one in self.records]
-        low, high = time_text(min(sealed)), time_text(max(sealed))
+        sealed = _span(time_text(one.place.sealed_ms * 10**6) for one in self.records)
         yield (
-            f"The robot {self.robot} signed {counted(len(self.records), 'record')} as given here, sealed"
-            f" {f'at {low}' if low == high else f'between {low} and {high}'} by its own clock. The robot is whoever has"
-            " the key for which the CA made its certificate."
+            f"The robot {self.robot} signed {counted(len(self.records), 'record')} as given here, sealed {sealed} by"
+            " its own clock. The robot is whoever has the key for which the CA made its certificate."
         )
         yield (
             "It signed them for this contract and chain, each at its place in its log, and no other record can stand"
             " at that place."
         )
         if asked is not None:
+            made = _span(time_text(time * 10**9) for time in asked.times.values())
+            revoked = "REVOKED" if asked.revoked else "not revoked"
             yield (
-                f"The contract {self.contract} on the chain with the id {self.chain_id} has this since"
-                f" {_blocks(asked.times)}, says {asked.node}. It counts {counted(asked.chunks, 'chunk')} of this robot,"
-                f" which is {'REVOKED' if asked.revoked else 'not revoked'} now."
+                f"The contract {self.contract} on the chain with the id {self.chain_id} has this since block"
+                f" {_span(asked.times)} ({made} by the chain's clock), says {asked.node}. It counts"
+                f" {counted(asked.chunks, 'chunk')} of this robot, which is {revoked} now."
             )
 
     def proves_not(self, asked: Asked | None = None) -> Iterator[str]:
         if asked is not None:
             yield f"That {asked.node} is a node of the right chain, and that the chain will not replace these blocks."
         else:
-            blocks = sorted({one.place.block for one in self.records})
-            span = str(blocks[0]) if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
+            blocks = _span(one.place.block for one in self.records)
             yield (
-                f"That the chain has it, in block {span} as the file says: ask a node (--node). If it has not, somebody"
-                " could have made this with a stolen key of the robot that is revoked or replaced since."
+                f"That the chain has it, in block {blocks} as the file says: ask a node (--node). If it has not,"
+                " somebody could have made this with a stolen key of the robot that is revoked or replaced since."
             )
         yield (
             "That CA, contract and chain are the right ones: compare the CA's fingerprint, the contract's address and"
@@ -300,11 +299,10 @@ def _fingerprints(certificates: Sequence[bytes]) -> str:
     return ", ".join(grouped(sm3.digest(one).hex()) for one in certificates)
 
 
-def _blocks(times: dict[int, int]) -> str:
-    (first, begin), (last, end) = min(times.items()), max(times.items())
-    if first == last:
-        return f"block {first} ({time_text(begin * 10**9)} by the chain's clock)"
-    return f"blocks {first} to {last} ({time_text(begin * 10**9)} to {time_text(end * 10**9)} by the chain's clock)"
+def _span(values: Iterable[Any]) -> str:
+    """The least and the greatest, or the one."""
+    ascending = sorted({*values})
+    return " to ".join(map(str, dict.fromkeys((ascending[0], ascending[-1]))))
 
 
 def ask(evidence: Evidence, statement: Statement, roots: Sequence[x509.Certificate], url: str) -> Asked:

@@ -384,8 +384,13 @@ class Trajectory:
                 figure.text(0.5, 0.5, "no positions in these records", ha="center", va="center")
                 return 0
             axes = figure.add_subplot(aspect="equal", adjustable="datalim", xlabel="x in m", ylabel="y in m")
+            axes.set_title("a dot is the beginning, a square the end", fontsize="small")
             for topic, points in self.tracks.items():
-                _draw_track(axes, shown(topic, 60), points.count, sorted({*points.kept, points.last}))
+                times, xs, ys = zip(*sorted({*points.kept, points.last}), strict=True)
+                seconds = (times[-1] - times[0]) / 1e9
+                (line,) = axes.plot(xs, ys, label=f"{_label(topic)}: {points.count:,} positions, {seconds:,.1f} s")
+                for at, marker in ((0, "o"), (-1, "s")):
+                    axes.plot(xs[at], ys[at], marker=marker, color=line.get_color())
             axes.grid(alpha=0.3)
             axes.legend(loc="best", fontsize="small")
         return sum(points.count for points in self.tracks.values())
@@ -422,7 +427,7 @@ class Curves:
                 for (_, topic), points in (item for item in self.curves.items() if item[0][0] == field_):
                     times = numpy.array([time for time, _, _ in points.kept for _ in range(2)], "datetime64[ns]")
                     values = [value for _, *both in points.kept for value in both]
-                    label = f"\u200b{shown(topic, 60)}: {points.count:,} values"
+                    label = f"{_label(topic)}: {points.count:,} values"
                     axes.plot(times, values, linewidth=1, label=label, marker="." if points.count == 1 else None)
                     axes.legend(loc="best", fontsize="small")
                 axes.set_ylabel(shown(field_, 40))
@@ -470,11 +475,6 @@ def _is_distance(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < _FARTHEST and isfinite(value)
 
 
-def _draw_track(axes: Any, label: str, count: int, track: list[_Point]) -> None:
-    xs, ys = [x for _, x, _ in track], [y for _, _, y in track]
-    seconds = (track[-1][0] - track[0][0]) / 1e9
-    # A label that begins with "_" would be left out of the legend.
-    (line,) = axes.plot(xs, ys, linewidth=1.4, label=f"\u200b{label}: {count:,} positions, {seconds:,.1f} s")
-    for at, marker, text, below in ((0, "o", "start", 6), (-1, "s", "end", -10)):
-        axes.plot(xs[at], ys[at], marker=marker, color=line.get_color(), linestyle="none")
-        axes.annotate(text, (xs[at], ys[at]), textcoords="offset points", xytext=(6, below), fontsize="small")
+def _label(topic: str) -> str:
+    """In a legend; one that began with "_" would be left out."""
+    return f"\u200b{shown(topic, 60)}"

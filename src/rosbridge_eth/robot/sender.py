@@ -26,7 +26,7 @@ from rosbridge_eth.channel import (
     State,
     Unresolved,
 )  # fmt: skip
-from rosbridge_eth.log.chunk import MAX_TIME_MS, STREAM_SIZE, Chunk, Malformed
+from rosbridge_eth.log.chunk import MAX_TIME_MS, STREAM_SIZE
 from rosbridge_eth.log.hop import ELSEWHERE, FORKED, HopError, ServerState, encode_offer
 from rosbridge_eth.log.store import NO_DIGEST, NOWHERE
 from rosbridge_eth.log.writer import LogWriter
@@ -187,15 +187,14 @@ class Sender:
             return
         while self._sent < self._spool.newest and (rows := self._spool.rows(self._sent, AT_ONCE)):
             for row in rows:
-                [encoded] = self._spool.chunks([row.place])
-                if (chunk := _parsed(encoded)) is None or chunk.header.digest != row.digest:
+                if (chunk := self._spool.chunk(row.place, row.digest)) is None:
                     self._set_aside(row.digest)
                     continue
                 previous = chunk.header.previous
                 if previous != self._digest and self._spool.place(previous):
                     self._fork(row.place, now)
                     return
-                if not self._put(encoded, b"" if previous == self._digest else self._digest):
+                if not self._put(chunk.encoded, b"" if previous == self._digest else self._digest):
                     return
                 self._sent, self._digest = row.place, row.digest
 
@@ -207,7 +206,7 @@ class Sender:
         if ours or state.head < self._spool.covered:
             self._spool.stored(state.head)
         if place := self._spool.place(state.refused):
-            chunk = _parsed(*self._spool.chunks([place]))
+            chunk = self._spool.chunk(place, state.refused)
             if chunk is None or not self._writer.wrote(chunk):
                 self._set_aside(state.refused)
 
@@ -246,11 +245,3 @@ class Sender:
         self._client.send(offer)
         self.sent += 1
         return True
-
-
-def _parsed(encoded: bytes) -> Chunk | None:
-    """None where the disk has changed it so that it is none any more."""
-    try:
-        return Chunk.parse(encoded)
-    except Malformed:
-        return None

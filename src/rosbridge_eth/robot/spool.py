@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosbridge_eth.errors import StoreError
-from rosbridge_eth.log.chunk import Chunk, Log
+from rosbridge_eth.log.chunk import Chunk, Log, Malformed
 from rosbridge_eth.log.database import DiskFull
 from rosbridge_eth.log.sqlite import SqliteStore
 from rosbridge_eth.log.store import DEAD_LETTERS, NOWHERE, Offer, Outcome, Row, place_of
@@ -94,6 +94,14 @@ class Spool:
         """The encoded chunks at these places."""
         return self._store.chunks(self._tk, places)
 
+    def chunk(self, place: bytes, digest: bytes) -> Chunk | None:
+        """The chunk there, whose header has this digest; None where the disk changed it."""
+        try:
+            found = Chunk.parse(*self.chunks([place]))
+        except Malformed:
+            return None
+        return found if found.header.digest == digest else None
+
     def place(self, digest: bytes) -> bytes | None:
         """The place of the chunk with this header, None if it is not here, or set aside."""
         return self._store.place(self._tk, digest)
@@ -120,7 +128,10 @@ class Spool:
             self._remove(rows[:-1])
             count += sum(row.taken_at != _CONFIRMED for row in rows[:-1])
         if rows and rows[0].taken_at != _CONFIRMED:
-            self._store.replace(self._tk, Chunk.parse(*self.chunks([rows[0].place])), _CONFIRMED)
+            if chunk := self.chunk(rows[0].place, rows[0].digest):
+                self._store.replace(self._tk, chunk, _CONFIRMED)
+            else:
+                self._remove(rows)
             count += 1
         return count
 
@@ -195,7 +206,8 @@ class Spool:
         """The oldest chunk with a body; those before it are counted as bare."""
         while rows := self.rows(self._bare_to, 200):
             for row in rows:
-                if row.taken_at != _DROPPED and (chunk := Chunk.parse(*self.chunks([row.place]))).body:
+                chunk = None if row.taken_at == _DROPPED else self.chunk(row.place, row.digest)
+                if chunk and chunk.body:
                     return chunk
                 self._bare_to, self._bare = row.place, self._bare + row.size
         return None

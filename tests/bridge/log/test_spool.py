@@ -125,6 +125,29 @@ def test_what_the_server_lost_is_not_what_a_full_spool_gives_up_first(path):
     spool.close()
 
 
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("at", [0, 10, 138])
+def test_a_chunk_that_the_disk_changed_keeps_nothing_from_going_on(path, at, full):
+    """at: which byte: version, place, number of grants."""
+    spool = open_spool(path, 5300)
+    made = fill(spool, 4, size=1000)
+    spool.close()
+    changed = bytearray(made[0].encoded)
+    changed[at] ^= 1
+    with sqlite3.connect(path) as disk:
+        disk.execute("UPDATE chunk SET chunk = ? WHERE digest = ?", (bytes(changed), made[0].header.digest))
+    disk.close()
+    spool = open_spool(path, 5300)
+    assert spool.chunk(place(made[0]), made[0].header.digest) is None
+    assert spool.chunk(place(made[1]), made[1].header.digest) == made[1]
+    if full:
+        spool.append(chunk(0, OTHER, size=1900, previous=spool.last_digest))
+    else:
+        assert spool.confirmed(place(made[0])) == 1 and spool.confirmed(place(made[0])) == 0
+    assert numbers(all_of(spool))[:3] == [1, 2, 3]
+    spool.close()
+
+
 def test_what_is_refused_is_set_aside_and_not_sent_again(path, spool):
     made = fill(spool, 4)
     assert spool.set_aside(made[2].header.digest) == place(made[2])

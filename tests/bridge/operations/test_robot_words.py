@@ -145,7 +145,7 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert metrics.CONDITION.labels("robot", "server's name has an address")._value.get() == 0
+    assert metrics.FIGURES["condition", (("process", "robot"), ("name", "server's name has an address"))] == 0
     [said] = warnings(caplog)
     why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
     assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary

@@ -196,7 +196,7 @@ def test_what_it_proves_and_what_not_is_said_in_words(one: str, span: str, node:
     found = check(one)
     said = " ".join(found.proves())
     assert "robot_1 signed 1 record as given here" in said and "no other record can stand at that place" in said
-    assert "between" in " ".join(check(span).proves())
+    assert "sealed 2026-11-22T10:0" in (said := " ".join(check(span).proves())) and "Z to 2026-11-22T10:0" in said
     limits = " ".join(found.proves_not())
     assert f"in block {found.records[0].place.block} as the file says: ask a node (--node)" in limits
     assert "no other records" in limits and "its clock was right" in limits and found.genesis in limits
