@@ -1,4 +1,4 @@
-"""The reference of every key, from the models: the tables of docs/configuration.md, which a test compares.
+"""The reference of every key, from the models: the lists in docs/configuration.md, which a test compares.
 
 python docs/make_configuration.py     writes them anew, between their markers
 """
@@ -58,11 +58,13 @@ def _title(schema: dict[str, Any], section: dict[str, Any]) -> str:
 
 
 def _table(section: dict[str, Any]) -> str:
-    lines, words = ["| key | value | default | |", "| --- | --- | --- | --- |"], described(section)
+    lines, words = [], described(section)
     for key, value in section["properties"].items():
+        if key == "kind":  # the heading has it
+            continue
         default = "required" if key in section.get("required", ()) else _default(value)
-        cells = (f"`{key}`", _kind(value), default, words[key])
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        told = ", ".join(filter(None, (_kind(value), default)))
+        lines.append(f"- `{key}` ({told}): {words[key]}")
     return "\n".join(lines)
 
 
@@ -80,9 +82,9 @@ def _kind(value: dict[str, Any]) -> str:
 
 def _default(value: dict[str, Any]) -> str:
     default = value.get("default")
-    if default is None or isinstance(default, dict):
+    if default in (None, []) or isinstance(default, dict):
         return ""
-    return f"`{json.dumps(_AS_WRITTEN.get(value.get('type', ''), lambda known: known)(default))}`"
+    return f"default `{json.dumps(_AS_WRITTEN.get(value.get('type', ''), lambda known: known)(default))}`"
 
 
 def rewritten(document: str) -> str:

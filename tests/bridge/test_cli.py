@@ -49,12 +49,10 @@ def fails(capsys: Capture, code: ExitCode, says: str, *arguments: str) -> str:
 
 @pytest.mark.parametrize("text, says", [
     ("topics = []\n", "names nothing to watch"),
-    ('topic = ["/a"]\n', "did you mean 'topics'"),
+    ('topic = ["/a"]\n', "unknown key 'topic'"),
     ('topics = "/a"\n', "input should be a valid list"),
     ("topics = [1]\n", "topics"),
     ('topics = ["/a"\n', "not TOML"),
-    (f'{ODOM}readers = []\n[source]\nkind = "sim"', "no reader"),
-    (f'{ODOM}readers = ["absent.pem"]\n[source]\nkind = "sim"', "does not exist"),
     (f'{ODOM}name = "robot_2"\n', "name"),
     (ODOM, '[source] with kind = "ros1"'),
     (f'{ODOM}[source]\nkind = "bag"\npath = "absent.bag"\n', "absent.bag"),
@@ -293,18 +291,13 @@ def test_up_takes_a_given_node_and_shows_no_picture_where_there_is_no_terminal(
     assert not Path("operator/chain.json").exists(), "the node is somebody else's"
 
 
-def test_the_passphrase_may_be_named_by_the_configuration_or_the_environment(
+def test_the_passphrase_may_be_named_by_the_environment(
     place: Place, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     fails(capsys, ExitCode.IDENTITY, "--passphrase-file", "mnemonic")
     monkeypatch.setenv("ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE", str(place.path / "pass"))
     assert run(["mnemonic"]) == 0
-    words = capsys.readouterr().out
-    assert len(words.split()) == 24
-    monkeypatch.delenv("ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE")
-    place.configure('name = "server"', f'name = "server"\npassphrase_file = "{place.path / "pass"}"')
-    assert run(["mnemonic"]) == 0
-    assert capsys.readouterr().out == words
+    assert len(capsys.readouterr().out.split()) == 24
 
 
 def test_accounts_are_restored_from_the_words_that_mnemonic_shows(place: Place, capsys: Capture) -> None:
@@ -351,7 +344,7 @@ def test_the_shell_completes_commands_and_options() -> None:
         return done.stdout.split()
 
     assert complete("rosbridge-eth st") == ["status"]
-    assert {"--home", "--follow", "--json"} <= {*complete("rosbridge-eth status --")}
+    assert {"--home", "--json"} <= {*complete("rosbridge-eth status --")}
 
 
 def test_without_the_bridge_packages_the_command_says_how_to_get_them() -> None:

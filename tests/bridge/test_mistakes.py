@@ -156,12 +156,11 @@ def test_another_reader_is_made_carried_and_given_to_a_robot(place: Place, capsy
     assert not any(secret in content for secret in (b"node-key", b"path-key", b"query-key", READERS))
     # As far as the node, which is not there: everything before it was found in the folder.
     fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "read", "robot_1", "--home", "carried", "--passphrase-file", "word")
-    config = load_robot_config(place.robot.config)
     roots = read_certificates((place.robot.identity / "ca.crt.pem").read_bytes())
-    before = reader_keys(config, place.robot, roots)
+    before = reader_keys(place.robot, roots)
     (place.robot.readers / "analyst.pem").write_bytes((carried / "public.pem").read_bytes())
     identity, _ = load_identity(carried, PASSWORD)
-    after = {key.to_bytes() for key in reader_keys(config, place.robot, roots)}
+    after = {key.to_bytes() for key in reader_keys(place.robot, roots)}
     assert after == {key.to_bytes() for key in before} | {identity.encryption_key.public_key.to_bytes()}
     assert run(["revoke", "analyst", "--role", "reader", *OPERATOR]) == 0, "that takes no node"
     with Registry(place.operator.registry) as registry:

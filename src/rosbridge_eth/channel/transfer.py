@@ -131,10 +131,7 @@ class Sending:
         """There is a segment to send."""
         while self._again and self._again[0] not in self._segments:
             heappop(self._again)
-        return bool(self._again) or self._has_new()
-
-    def _has_new(self) -> bool:
-        return bool(self._unsent) and self._next < self._below + SEGMENTS
+        return bool(self._again) or (bool(self._unsent) and self._next < self._below + SEGMENTS)
 
     def next(self, now: float) -> tuple[int, bytes] | None:
         """Number and frame of the next packet that may go now."""

@@ -50,9 +50,9 @@ FUNDS = 1000  # ETH that the operator has on a local chain
 
 
 def passphrase_of(home: OperatorHome, file: Path | None) -> bytes:
-    """The operator passphrase: from `file`, or the one that server.toml names, or asked for."""
-    configured = load_server_config(home.config).passphrase_file
-    return read_passphrase("operator", "Operator passphrase", file=file, configured=configured)
+    """The operator passphrase: from `file`, or asked for."""
+    load_server_config(home.config)  # a mistake in it is told before anybody types
+    return read_passphrase("operator", "Operator passphrase", file=file)
 
 
 def _ca(home: OperatorHome, passphrase: bytes, file: Path | None) -> CertificateAuthority:
@@ -105,8 +105,7 @@ def up(
         keys = enrolment.init_home(
             OperatorHome(home), secret, reader=ReaderHome(reader), reader_passphrase=secret, now=utc_now(),
             listen=listen or "0.0.0.0:7410", public=public, chain_url=chain or f"http://127.0.0.1:{free_port(8545)}",
-            passphrase_file=passphrase_file,
-        )
+        )  # fmt: skip
         talk(f"{home} is an operator's home and {reader} that of the reader `owner`, both under this passphrase.")
         place = OperatorHome(home)
     else:
@@ -240,8 +239,6 @@ def register(
     talk(f"{name} is registered in block {made.block}; its account is {made.account}.")
     if asked is None:
         talk(f"Its keys were made here: who has this home and its passphrase can sign as {name}.")
-    if made.unfunded:
-        talk(f"Its account has no ETH yet ({made.unfunded}); nothing is written for it until the server can pay.")
     if made.buried:
         talk(f"Dead letters now: {counted(made.buried, 'chunk')} of the old {name}; `status` lists them.")
     talk(f"It seals for these readers: {', '.join(made.readers)}.")

@@ -56,6 +56,8 @@ from rosbridge_eth.log.chunk import ledger_id, robot_id
 _LATEST = 2**35  # seconds since 1970; a later time is a damaged file's
 _FORMAT = "rosbridge-eth home 3"
 _UNFINISHED = ".unfinished"
+SERVER = "server"
+"""The name in the certificate of every operator's server."""
 
 
 class HomeKind(StrEnum):

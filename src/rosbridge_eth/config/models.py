@@ -1,14 +1,11 @@
-"""What can be configured, key by key. The docstrings are the reference's text (docs/configuration.md): what a
-table is for, then one paragraph for each key.
-
-A robot's whole configuration may be `topics = ["/robot_1/odom"]`, where the environment says which ROS is there.
+"""What can be configured. The docstrings are the text of docs/configuration.md: what a table is for, then one
+paragraph for each key.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (  # isort: skip
@@ -21,7 +18,6 @@ from rosbridge_eth.capture.rules import parse_paths
 from rosbridge_eth.config.home import ledger_of
 from rosbridge_eth.config.values import Address, DurationNs, FilePath, HostPort, TimeNs, seconds, size
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.log.chunk import MAX_READERS
 from rosbridge_eth.robot.blackbox import Condition, TriggerRule
 
 KIB, MIB, GIB = 2**10, 2**20, 2**30
@@ -110,26 +106,25 @@ Hash = Annotated[str, _matching("0x[0-9a-fA-F]{64}", "a hash is 0x and 64 hexade
 
 
 class TopicConfig(Section):
-    """A topic, or a pattern of topics, with how it is captured. A plain string is the same with nothing else set.
+    """A topic, or a pattern of topics. A plain string is a table with this topic alone.
 
-    topic: Name, or pattern: `*` and `?` within one part of the name, `**` across parts, `[ab]`.
+    topic: Name or pattern.
 
-    fields: What is captured: `"pose.pose.position.x"`, `"ranges[0]"`, `"poses[*].position"`, `"*"` for all. Without
-    it, all of the message.
+    fields: Paths such as `"pose.pose.position.x"`, `"ranges[0]"`, `"poses[*].position"`; without it, all.
 
     rate: Records per second, at most.
 
-    at: A moment: only the first message at that time or after it.
+    at: Only the first message at that time or after it.
 
-    once: Only the first message (of the period, if there is one).
+    once: Only the first message.
 
-    from: A period: only messages from then on.
+    from: Only messages from then on.
 
-    until: A period: only messages before then.
+    until: Only messages before then.
 
-    for: Length of the period, from `from` or from the first message.
+    for: Length of the period, from `from` or the first message.
 
-    trigger: The name of a `[[trigger]]`: records are kept in memory and go into the log only when that happens.
+    trigger: Keep records in memory until this `[[trigger]]` fires.
     """
 
     topic: Pattern
@@ -158,20 +153,18 @@ class TopicConfig(Section):
 
 
 class TriggerConfig(Section):
-    """An event for which records are kept in memory: when it happens, those of the last `before` are written, and those
-    of the next `after`. Topics say `trigger = NAME`. Memory is empty after a start.
+    """An event: when it fires, the records of the last `before` and of the next `after` go into the log.
 
-    name: What topics, the command `rosbridge-eth trigger NAME`, the log and `/metrics` call it.
+    name: Used by topics, `rosbridge-eth trigger NAME`, the log and `/metrics`.
 
-    before: How long records are kept, by the time at which their messages were received.
+    before: How long records are kept.
 
-    after: For so long after an event they are written as they come; another event meanwhile makes it longer.
+    after: For so long records are written as they come; another event starts it again.
 
-    memory: Bytes kept, at most: the records' JSON and 256 bytes for each. What has to go early is `lost` for "memory"
-    if an event follows.
+    memory: Bytes kept: the records' JSON, and 256 bytes for each.
 
-    when: Conditions, any of which is the event: a topic that is watched, a field, `==` `!=` `<` `<=` `>` `>=`, and a
-    number, `true`, `false` or a `"string"`. Without one, only the command and SIGUSR1 are.
+    when: Conditions, any of which fires: a watched topic, a field, `==` `!=` `<` `<=` `>` `>=`, and a number, `true`,
+    `false` or a `"string"`. Without one, only the command and SIGUSR1 fire.
     """
 
     name: Name
@@ -181,22 +174,12 @@ class TriggerConfig(Section):
     when: Annotated[list[Annotated[str, AfterValidator(_condition)]], BeforeValidator(_listed)] = []
 
 
-class CaptureConfig(Section):
-    """What holds for every topic.
-
-    field_limit: Largest field that is captured as it is; of a larger one its SM3 digest and length are captured, which
-    the log says once per topic.
-    """
-
-    field_limit: Annotated[int, size(high="48 KiB")] = 16 * KIB
-
-
 class BagConfig(Section):
-    """Replay a bag: ROS 1 `.bag`, ROS 2 folder, `.db3` or `.mcap`.
+    """A bag: ROS 1 `.bag`, ROS 2 folder, `.db3` or `.mcap`.
 
     kind: `bag`
 
-    path: The bag. A relative path starts at the folder of this file.
+    path: The bag.
 
     speed: Factor on the recorded pace, or `"max"`: as fast as records are taken.
     """
@@ -207,20 +190,18 @@ class BagConfig(Section):
 
 
 class Ros1Config(Section):
-    """A live ROS 1 master, with no ROS installed here (docs/howto-ros1.md).
+    """A live ROS 1 master; needs no ROS here ([howto-ros1.md](howto-ros1.md)).
 
     kind: `ros1`
 
-    master: The master's URI; without it, that of `ROS_MASTER_URI`, otherwise `http://localhost:11311`.
+    master: The master's URI; without it `ROS_MASTER_URI`, or `http://localhost:11311`.
 
-    hostname: Name or address under which the master reaches this machine; without it, `ROS_HOSTNAME`, `ROS_IP`, or the
-    address that this machine uses towards the master.
+    hostname: This machine as the master reaches it; without it `ROS_HOSTNAME`, `ROS_IP`, or its address towards the
+    master.
 
-    node: The name under which the robot appears in the graph; without it, one of its own for each process,
-    `/rosbridge_eth_MACHINE_PID`.
+    node: The robot's name in the graph; without it `/rosbridge_eth_MACHINE_PID`.
 
-    max_message: A larger message is not read, but counted. Messages that wait take at most twice as much memory,
-    and one may be arriving from each publisher.
+    max_message: A larger message is counted and not read. Up to twice as many bytes wait in memory.
     """
 
     kind: Literal["ros1"]
@@ -231,13 +212,13 @@ class Ros1Config(Section):
 
 
 class Ros2Config(Section):
-    """The live ROS 2 graph, through the rclpy of the Python that runs the robot.
+    """The live ROS 2 graph, through rclpy.
 
     kind: `ros2`
 
-    domain: The graph's domain; without it, that of `ROS_DOMAIN_ID`, or 0.
+    domain: The graph's domain; without it `ROS_DOMAIN_ID`, or 0.
 
-    node: The name under which the robot appears in the graph.
+    node: The robot's name in the graph.
 
     depth: Messages of a topic that the middleware keeps until they are taken.
     """
@@ -249,16 +230,15 @@ class Ros2Config(Section):
 
 
 class SimConfig(Section):
-    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`, so that anything can be tried. Every record says
-    that it is from a simulation.
+    """A simulated robot that publishes `/NAME/odom` and `/NAME/imu`. Every record says that it is simulated.
 
     kind: `sim`
 
-    robot: The NAME in its topics.
+    robot: NAME.
 
     seed: The same seed drives the same way.
 
-    rate: Odometry and IMU messages per second.
+    rate: Messages per second.
 
     duration: End after so long; without it, never.
 
@@ -278,15 +258,14 @@ SOURCE_KINDS: dict[str, type[AnySource]] = {"bag": BagConfig, "ros1": Ros1Config
 
 
 class LogConfig(Section):
-    """The log that the robot writes: what was captured in a `period`, from all topics, is one chunk of it.
+    """The robot's log.
 
-    period: A chunk closes so long after its first record, or when it is full. A power cut costs what was captured in
-    it; a longer one costs less gas a record.
+    period: A chunk holds what was captured in so long. A longer one costs less gas a record; a power cut loses up to
+    one.
 
-    heartbeat: With nothing to say for so long, an empty chunk is written, so that silence can be told from withholding.
+    heartbeat: After so long without records an empty chunk is written.
 
-    compress: Turned off, the size of a chunk no longer tells how alike its records are: who feeds one topic could
-    guess at another by it.
+    compress: If false, a chunk's size does not tell how alike its records are.
     """
 
     period: Annotated[float, seconds("50ms", "1h")] = 1.0
@@ -295,10 +274,10 @@ class LogConfig(Section):
 
 
 class SpoolConfig(Section):
-    """The log on the robot's disk: what is not confirmed on the chain. When it is full, what the server has goes first,
-    then the bodies of the oldest chunks; the log says so for good.
+    """The log on the robot's disk, until it is confirmed. When it is full, chunks that the server has go first, then
+    the bodies of the oldest; the log says so.
 
-    max_size: Bytes kept, at most.
+    max_size: Bytes.
     """
 
     max_size: Annotated[int, size("1 MiB")] = 256 * MIB
@@ -307,29 +286,21 @@ class SpoolConfig(Section):
 class RobotConfig(Section):
     """A robot's configuration, `robot.toml`.
 
-    topics: Topics to watch: names, patterns, or tables (below).
+    topics: Names, patterns, or tables (below).
 
-    nodes: Nodes to watch, by name or pattern: the topics they publish, resolved again every few seconds.
+    nodes: Nodes, by name or pattern: all topics that they publish.
 
-    server: HOST:PORT of the robot's shard of the server, or of any, which names the right one; without it, those in the
-    bundle the robot joined with. A name is asked for again while there is no session.
+    server: A shard of the server; without it, those that the bundle names.
 
-    channel: How session keys come about: SM2 key exchange, or the paper's transport of a key. No fallback.
+    channel: How session keys are made: SM2 key exchange, or the paper's transport of a key. No fallback.
 
-    readers: Certificates (PEM) of those who may read the records, 16 at most; without it, those in the folder `readers`
-    of the home: the bundle's and what is put there by hand. Joining again removes what its bundle does not name.
+    monitor: HTTP address of `/metrics`, such as `127.0.0.1:9465`; keep it private.
 
-    monitor: HTTP address of `/metrics`, such as `127.0.0.1:9465`; without it there is none. Keep it on the machine or a
-    private network.
+    source: Where messages come from (below); without it, what `ROS_VERSION` or `ROS_MASTER_URI` says.
 
-    source: Where messages come from (below). Without it, the ROS that the environment speaks of (`ROS_VERSION`,
-    `ROS_MASTER_URI`); where it speaks of none, the robot does not start.
+    log: Below.
 
-    capture: How all topics are captured (below).
-
-    log: The log (below).
-
-    spool: The log on the robot's disk (below).
+    spool: Below.
 
     trigger: Events for which records are kept in memory, at most 16 (below).
     """
@@ -338,10 +309,8 @@ class RobotConfig(Section):
     nodes: list[Pattern] = []
     server: HostPort | None = None
     channel: Mode = "exchange"
-    readers: list[FilePath] | None = None
     monitor: HostPort | None = None
     source: Annotated[AnySource, Discriminator("kind")] | None = None
-    capture: CaptureConfig = CaptureConfig()
     log: LogConfig = LogConfig()
     spool: SpoolConfig = SpoolConfig()
     trigger: Annotated[list[TriggerConfig], Field(max_length=16)] = []
@@ -354,10 +323,6 @@ class RobotConfig(Section):
         if twice := [name for number, name in enumerate(names) if name in names[:number]]:
             raise ValueError(f"names topic {twice[0]} twice")
         self._check_triggers()
-        if self.readers is not None and not self.readers:
-            raise ValueError(
-                "has no reader: nobody could open the records; name a certificate in `readers` or leave the key out"
-            )
         return self
 
     def _check_triggers(self) -> None:
@@ -386,7 +351,7 @@ class RobotConfig(Section):
         return [
             TopicRule(
                 topic.topic, tuple(topic.fields), topic.rate, topic.at, topic.once, topic.from_, topic.until,
-                topic.for_, self.capture.field_limit, topic.trigger,
+                topic.for_, trigger=topic.trigger,
             )
             for topic in [*self.topics, *([TopicConfig(topic="**")] if self.nodes else [])]
         ]
@@ -410,35 +375,18 @@ class RobotConfig(Section):
             )
         return SOURCE_KINDS[kind].model_validate({"kind": kind}), why
 
-    def reader_files(self, joined: Path) -> list[Path]:
-        """The readers' certificates, 1 to 16: as configured, or those in the folder `joined`. Else ConfigError."""
-        files = sorted(joined.glob("*.pem")) if self.readers is None else self.readers
-        if absent := [file for file in files if not file.is_file()]:
-            raise ConfigError(f"reader certificate {absent[0]} does not exist; correct `readers`")
-        if not files:
-            raise ConfigError(
-                f"no reader: there is no certificate in {joined} and `readers` names none, so nobody could open the "
-                "records; join again with the bundle, or name a certificate in `readers`"
-            )
-        if len(files) > MAX_READERS:
-            raise ConfigError(
-                f"there are {len(files)} readers, and a chunk is for {MAX_READERS} at most; people may share a reader's"
-                " key"
-            )
-        return files
-
 
 # The server
 
 
 class ChainConfig(Section):
-    """The node, and how long to wait before a record counts.
+    """The chain.
 
     url: JSON-RPC URL of a node.
 
     confirmations: Blocks, its own included, after which a chunk is confirmed.
 
-    max_fee_gwei: No transaction offers more per unit of gas.
+    max_fee_gwei: Highest price of a unit of gas that is offered.
     """
 
     url: NodeUrl = Field(default="http://127.0.0.1:8545", repr=False)
@@ -447,13 +395,13 @@ class ChainConfig(Section):
 
 
 class StoreConfig(Section):
-    """The server's replica of the robots' logs, until they are on the chain.
+    """The robots' logs at the server, until they are confirmed.
 
-    url: `"sqlite"`, a file for each shard in the server's folder, or the URL of a Redis, which all shards share.
+    url: `"sqlite"`, a file for each shard, or the URL of a Redis for all of them.
 
-    max_size: Bytes of chunks that a shard keeps in its file; dead letters come on top. A Redis has its own `maxmemory`.
+    max_size: Bytes of a shard's file, without dead letters. A Redis has its own `maxmemory`.
 
-    share: Bytes of one robot. Above it, that robot waits, and no other.
+    share: Bytes of one robot; above it, that robot waits.
     """
 
     url: StoreUrl = Field(default="sqlite", repr=False)
@@ -462,14 +410,14 @@ class StoreConfig(Section):
 
 
 class FundsConfig(Section):
-    """Robots' accounts are topped up by the operator's; what one robot can spend is bounded.
+    """ETH of the robots' accounts, from the operator's.
 
-    below: Top up when an account has less ETH than this.
+    below: Top up when an account has less ETH.
 
-    by: By so much ETH. The contract refuses above 5 ETH.
+    by: By so much ETH.
 
-    gas_per_day: Gas that one robot may use in 24 hours, and at once that of one; what is above it waits. The default
-    is enough for about 40 records a second; `topics` says what a robot's take.
+    gas_per_day: Gas that a robot may use in 24 hours, and an hour's worth at once; the rest waits. The default is
+    about 40 records a second (`topics` tells what a robot's take).
     """
 
     below: float = Field(default=0.05, ge=1e-6, lt=5)
@@ -480,39 +428,29 @@ class FundsConfig(Section):
 class ServerConfig(Section):
     """The server's configuration, `server.toml`.
 
-    listen: UDP address on which robots are answered: that of the first shard, and each further one has the next port.
+    listen: UDP address of the first shard; each further one has the next port.
 
-    public: The first shard's address as robots reach it, for their bundles; without it, `listen`. A list has that of
-    every shard, where they run on several machines.
+    public: The first shard's address as robots reach it; without it, `listen`. A list has each shard's.
 
-    name: The name in the server's certificate.
+    shards: Processes, each with its port, store and submitter ([howto-shards.md](howto-shards.md)).
 
-    shards: Processes, each with its port, store and submitter; each robot belongs to one of them. It may be changed at
-    any time (docs/howto-shards.md).
+    channel: Handshake modes that are taken: `"exchange"`, `"transport"`.
 
-    channel: Handshake modes that are taken: `"exchange"`, and `"transport"` where it is wanted.
+    monitor: HTTP address of the first shard's `/metrics`, such as `127.0.0.1:9464`, and the next port for each further
+    one; keep it private.
 
-    monitor: HTTP address of `/metrics`, such as `127.0.0.1:9464`, of the first shard, and each further one has the next
-    port; without it there is none. Whoever reaches it reads names, balances and counts: keep it on the machine or a
-    private network.
+    chain: Below.
 
-    passphrase_file: A file whose first line is the operator passphrase, for commands that are given none and a server
-    that starts by itself. Whoever reads it and the home is the operator.
+    store: Below.
 
-    chain: The node (below).
-
-    store: The replica of the robots' logs (below).
-
-    funds: Robots' accounts (below).
+    funds: Below.
     """
 
     listen: HostPort = Address("0.0.0.0", 7410)  # noqa: S104 - a server's default
     public: Annotated[list[HostPort], BeforeValidator(_listed)] = []
-    name: Name = "server"
     shards: int = Field(default=1, ge=1, le=64)
     channel: list[Mode] = Field(default=["exchange"], min_length=1)
     monitor: HostPort | None = None
-    passphrase_file: FilePath | None = None
     chain: ChainConfig = ChainConfig()
     store: StoreConfig = StoreConfig()
     funds: FundsConfig = FundsConfig()
@@ -541,16 +479,15 @@ class ServerConfig(Section):
 
 
 class ReaderConfig(Section):
-    """A reader's configuration, `reader.toml`: all it takes to read, the server is not asked.
+    """A reader's configuration, `reader.toml`, as `deploy` writes it.
 
     contract: The contract's address.
 
-    chain_id: The chain's id, which every signature covers.
+    chain_id: The chain's id.
 
-    genesis: The hash of the chain's first block, which every signature covers, too.
+    genesis: The hash of the chain's first block.
 
-    chain: JSON-RPC URL of a node of the chain, or a list of them: what they say of a robot is compared, and where they
-    disagree the log is not sound.
+    chain: JSON-RPC URL of a node, or a list: where nodes disagree, the log is not sound.
     """
 
     contract: ContractAddress

@@ -1,8 +1,8 @@
 """Where passphrases come from: a file, the service manager's credentials folder, or a prompt. Never argv.
 
-The file is named by an option, by $ROSBRIDGE_ETH_NAME_PASSPHRASE_FILE (NAME in capitals) or by the configuration.
-systemd hands secrets to a service as files in $CREDENTIALS_DIRECTORY (systemd.exec(5), LoadCredential=); there the
-passphrase is called rosbridge-eth-NAME.
+The file is named by an option or by $ROSBRIDGE_ETH_NAME_PASSPHRASE_FILE (NAME in capitals). systemd hands secrets to a
+service as files in $CREDENTIALS_DIRECTORY (systemd.exec(5), LoadCredential=); there the passphrase is called
+rosbridge-eth-NAME.
 """
 
 from __future__ import annotations
@@ -19,27 +19,24 @@ from rosbridge_eth.errors import IdentityError
 from rosbridge_eth.terminal import talk
 
 
-def passphrase_file(
-    name: str, *, configured: Path | None = None, environment: Mapping[str, str] = os.environ
-) -> Path | None:
-    """The file that holds the passphrase called `name`, where the environment or the configuration names one."""
+def passphrase_file(name: str, environment: Mapping[str, str] = os.environ) -> Path | None:
+    """The file that holds the passphrase called `name`, where the environment names one."""
     if named := environment.get(f"ROSBRIDGE_ETH_{name.upper()}_PASSPHRASE_FILE"):
         return Path(named)
-    folder = environment.get("CREDENTIALS_DIRECTORY")
-    file = Path(folder, f"rosbridge-eth-{name}") if folder else None
-    return file if file is not None and file.exists() else configured
+    file = Path(environment.get("CREDENTIALS_DIRECTORY", "/"), f"rosbridge-eth-{name}")
+    return file if file.exists() else None
 
 
 def read_passphrase(
-    name: str, prompt: str, *, file: Path | None = None, configured: Path | None = None, confirm: bool = False,
+    name: str, prompt: str, *, file: Path | None = None, confirm: bool = False,
     environment: Mapping[str, str] = os.environ,
 ) -> bytes:
     """The passphrase called `name` ("operator", "robot", "reader", "ca"), without its line end.
 
     Looked for in `file`, then where `passphrase_file` says, then asked for (twice with `confirm`). IdentityError
-    where there is none. configured: the file that server.toml names.
+    where there is none.
     """
-    if file := file or passphrase_file(name, configured=configured, environment=environment):
+    if file := file or passphrase_file(name, environment):
         return _from_file(file)
     option = "--password-file" if name == "robot" or (name == "reader" and confirm) else "--passphrase-file"
     if not sys.stdin.isatty():

@@ -50,14 +50,10 @@ def parse_seconds(value: Any) -> float:
 
 def parse_time(value: Any) -> int:
     """Nanoseconds since 1970."""
-    moment = value
-    if isinstance(value, str):
-        try:
-            moment = datetime.fromisoformat(value)
-        except ValueError:
-            moment = None
-    if not isinstance(moment, datetime):
-        raise ValueError(f'is {str(value)!r}; write a time such as "2026-11-21T10:00:00Z"')
+    try:
+        moment = datetime.fromisoformat(str(value))
+    except ValueError:
+        raise ValueError(f'is {str(value)!r}; write a time such as "2026-11-21T10:00:00Z"') from None
     if moment.tzinfo is None:
         raise ValueError(f'is {str(value)!r}; say in which time zone: end it with "Z" or an offset such as "+08:00"')
     passed = moment - _EPOCH

@@ -200,7 +200,7 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> Join
         for file in others:
             file.unlink()
         if others:
-            log.warning("no longer sealed for %s: the bundle does not name them; `readers` in robot.toml can",
+            log.warning("no longer sealed for %s: the bundle does not name them",
                         ", ".join(file.stem for file in others))  # fmt: skip
         home.raise_clock_floor(peer.not_before.timestamp())
         home.save_bridge(bundle.end)

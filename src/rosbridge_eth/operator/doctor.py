@@ -1,7 +1,8 @@
 """`doctor`: tries everything that a home depends on, for real, and names the fix for what does not work.
 
-A check is one function that yields findings. It changes nothing: what is not there yet is not made, and a port or a
-session that is tried is given back.
+A check is a function that yields findings. What a running home shows comes from `status`; the checks here try the rest:
+keys, certificates, ports, the source, a session. Nothing is changed or made, and a port or session that was tried is
+given back.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import sqlite3
 import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import typer
 
@@ -23,22 +24,15 @@ from rosbridge_eth import identity as ids
 from rosbridge_eth.channel import Client, ClientConfig, Connected, Event, HandshakeFailed, Mode
 from rosbridge_eth.channel.udp import UdpLoop, client_socket, server_socket
 from rosbridge_eth.config import Address, RobotConfig, load_reader_config, load_robot_config, load_server_config
-from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of, shard_of
+from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.config.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.errors import BridgeError
-from rosbridge_eth.log.chunk import Log, robot_id
-from rosbridge_eth.log.database import InUse, NothingThere
-from rosbridge_eth.operator.registry import Registry, differences
+from rosbridge_eth.files import read_file
+from rosbridge_eth.operator import status
 from rosbridge_eth.operator.status import span
-from rosbridge_eth.robot import sources
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
 from rosbridge_eth.robot.sender import mend
-from rosbridge_eth.robot.spool import Spool
-from rosbridge_eth.robot.topics import offered
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
-
-if TYPE_CHECKING:
-    from rosbridge_eth.ledger import Ledger
 
 HANDSHAKE_TIME, ATTEMPT_TIME = 6.0, 2.5  # seconds for a server to answer; for an attempt, with which a refusal is known
 EXPIRY = timedelta(days=30)
@@ -99,17 +93,11 @@ def clock(home: Home, secret: bytes | None) -> Findings:
 def files(home: Home, secret: bytes | None) -> Findings:
     mode = stat.S_IMODE(home.path.stat().st_mode)
     if mode & 0o077:
-        result, may = (broken, "write to") if mode & 0o022 else (note, "look into")
-        yield result("home", f"others may {may} {home.path} (mode {mode:04o})", f"chmod 700 {home.path}")
-    elif not os.access(home.path, os.W_OK):
-        yield broken("home", f"{home.path} is not writable for this user", "run as the user the service runs as")
+        yield broken("home", f"{home.path} is open to others (mode {mode:04o})", f"chmod 700 {home.path}")
     else:
         yield ok("home", f"{home.path}, its owner's alone")
     for key in sorted([*home.path.rglob("*.key.pem"), *home.path.glob("accounts.json")]):
-        mode = stat.S_IMODE(key.stat().st_mode)
-        if mode & 0o077:
-            yield broken("key files", f"{key} is open to others (mode {mode:04o})",
-                         f"chmod 600 {key}, and if it may have been read, make new keys")
+        read_file(key, private=True)
 
 
 def disk(home: Home, secret: bytes | None) -> Findings:
@@ -138,33 +126,22 @@ def certificates(folder: Path, renewal: str) -> Findings:
                 yield ok("certificates", f"{path.name} of {folder.name} until {each.not_after:%Y-%m-%d}")
 
 
-def process(home: Home, name: str, take_ports: Callable[[], object]) -> Findings:
-    """A process of this home that runs is ready; while it does not run its ports are free (else NetworkError)."""
-    from rosbridge_eth.server import metrics
-
-    figures = metrics.running(home.path).get(name)
-    if figures is None:
-        take_ports()
-        yield ok(name, "does not run; its ports are free")
-    elif failing := metrics.failing(figures):
-        yield broken(name, f"runs and is not ready: {', '.join(failing)}", "see its log, and what is said here")
-    else:
-        yield ok(name, "runs, and is ready")
-
-
-def chain(ledger: Ledger) -> Findings:
-    """The node answers, has our contract, and its time is ours."""
-    head = ledger.block()
-    age = time.time() - head.time
-    yield ok("node", f"{ledger.url} answers; block {head.number}, {span(max(0.0, age))} old")
-    ledger.check()
-    yield ok("contract", f"{ledger.contract} on chain {ledger.chain_id} has the code of this version")
+def node_found(url: str, block: int, age: float) -> Findings:
+    """age: of the node's last block by this machine's clock, in seconds."""
+    yield ok("node", f"{url} answers; block {block}, {span(max(0.0, age))} old")
     if age < -WRONG_CLOCK:
         yield broken("clock", f"it is {span(-age)} behind the last block", "set this machine's clock")
     elif age > OLD_HEAD:
         yield broken("clock", f"by it, the last block is {span(age)} old",
                      "set the clock if it is ahead; else see to the chain's nodes, which make no blocks (a local chain"
                      " makes the next one with the next transaction)")
+
+
+def state(report: status.Report) -> Findings:
+    """What `status` finds broken."""
+    for what, said in [*report["alarms"], *report["unknown"]]:
+        if (what, said) != status.NO_SERVER:
+            yield broken(what, said)
 
 
 # An operator's home
@@ -186,60 +163,28 @@ def operator_passphrase(home: OperatorHome, secret: bytes | None) -> Findings:
     yield ok("passphrase", "opens the server's keys and the accounts")
 
 
-def shards(home: OperatorHome, secret: bytes | None) -> Findings:
+def operations(home: OperatorHome, secret: bytes | None) -> Findings:
+    """What `status` finds; and where no server runs here, whether its ports are free."""
     from rosbridge_eth.server import metrics
-    from rosbridge_eth.server.shard import name_of
 
-    config = load_server_config(home.config)
-
-    def take_ports(shard: int) -> None:
-        server_socket(config.listen.next(shard)).close()
-        metrics.require_free(config.monitor and config.monitor.next(shard))
-
-    for shard in range(config.shards):
-        yield from process(home, name_of(shard), partial(take_ports, shard))
-
-
-def registry(home: OperatorHome, secret: bytes | None) -> Findings:
-    with Registry(home.registry) as opened:
-        yield ok("registry", f"{sum(name.revoked_at is None for name in opened.all())} names in force")
-
-
-def store(home: OperatorHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.server.shard import open_store
-
-    if not home.deployment_file.exists():
-        yield skipped("store", "no contract is deployed yet", f"run `deploy --home {home.path}`")
-        return
-    config, waits, found = load_server_config(home.config), 0, "there is none yet; the server makes it"
-    for shard in range(config.shards):
-        with suppress(NothingThere), closing(open_store(config, home, shard, read_only=True)) as opened:
-            opened.check()
-            waits += sum(opened.waiting(tk).chunks for tk in opened.sizes() if shard_of(tk, config.shards) == shard)
-            found = f"{waits} chunks wait"
-    yield ok("store", found)
-
-
-def operator_node(home: OperatorHome, secret: bytes | None) -> Findings:
-    from rosbridge_eth.ledger import Ledger
-    from rosbridge_eth.ledger.contract import WEI_PER_ETH
-
-    config = load_server_config(home.config)
-    with closing(Ledger.connect(config.chain.url, home.deployment())) as ledger, Registry(home.registry) as opened:
-        yield from chain(ledger)
-        if ledger.operator() != home.account:
-            yield broken("operator", f"the contract's operator is {ledger.operator()}, this home's {home.account}",
-                         "use the home of that account, or let it offer and this one accept the role")
-        treasury = ledger.balance(home.account) / WEI_PER_ETH
-        if treasury < config.funds.by:
-            yield broken("treasury", f"{home.account} has {treasury:.4f} ETH, a top-up takes {config.funds.by:g}",
-                         f"send ETH to {home.account}")
-        else:
-            yield ok("treasury", f"{treasury:.4f} ETH")
-        robots = [*opened.robots()]
-        standings = dict(zip(robots, ledger.standings(robots), strict=True))
-        for name, difference in differences(opened.all(), standings).items():
-            yield broken("registration", f"{name}: {difference}")
+    report, config = status.of_operator(home), load_server_config(home.config)
+    found = [*state(report)]
+    yield from found
+    waits = sum(robot.get("waiting", {}).get("chunks", 0) for robot in report["robots"].values())
+    works = {
+        "registry": f"{sum(each['revoked'] is None for each in report['names'])} names in force",
+        "store": f"{waits} chunks wait", "treasury": f"{report['operator']['eth'] or 0:.4f} ETH",
+    }  # fmt: skip
+    yield from (ok(what, said) for what, said in works.items() if what not in {each.what for each in found})
+    if node := report["node"]:
+        yield from node_found(node["url"], node["block"], node["age_seconds"])
+    if report["process"] is None:
+        for shard in range(config.shards):
+            server_socket(config.listen.next(shard)).close()
+            metrics.require_free(config.monitor and config.monitor.next(shard))
+        yield ok("server", "does not run here; its ports are free")
+    elif not report["process"]:
+        yield ok("server", "runs, and is ready")
 
 
 # A robot's home
@@ -264,39 +209,24 @@ def robot_certificates(home: RobotHome, secret: bytes | None) -> Findings:
 def readers(home: RobotHome, secret: bytes | None) -> Findings:
     home.bridge()  # with which the CA's certificate came
     roots = ids.read_certificates((home.identity / "ca.crt.pem").read_bytes())
-    yield ok("readers", f"{len(reader_keys(load_robot_config(home.config), home, roots))} can open what it writes")
-
-
-def source(home: RobotHome, secret: bytes | None) -> Findings:
-    config = load_robot_config(home.config)
-    settings, why = config.source_and_why(os.environ)
-    with closing(sources.open_source(settings, sources.Selection.of(config))) as opened:
-        offers = offered(opened)
-    if settings.kind == "sim":
-        yield note("source", f"SIMULATED, {why}", "write a [source] for a real robot")
-    elif not offers:
-        yield note("source", f"{settings.kind} ({why}) answers and offers no topic", "start what publishes")
-    else:
-        yield ok("source", f"{settings.kind} ({why}) offers {len(offers)} topics")
+    yield ok("readers", f"{len(reader_keys(home, roots))} can open what it writes")
 
 
 def session(home: RobotHome, secret: bytes | None) -> Findings:
     """The spool, and a session with the server as the robot would make it."""
     from rosbridge_eth.server import metrics
 
-    end, config = home.bridge(), load_robot_config(home.config)
-    log, server = Log(end.ledger, robot_id(end.robot)), config.server or end.addresses()[0]
-    yield from process(home, "robot", lambda: metrics.require_free(config.monitor))
-    try:
-        Spool(home.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True).close()
-        yield ok("spool", "opens")
-    except NothingThere:
-        yield ok("spool", "none yet; the first start makes it")
-    except InUse:
-        yield ok("spool", "in use by the robot that runs")
+    report, end, config = status.of_robot(home), home.bridge(), load_robot_config(home.config)
+    server = config.server or end.addresses()[0]
+    yield from state(report)
+    if report["runs"]:
+        if not report["alarms"]:
+            yield ok("robot", "runs, and is ready")
         yield skipped("server", f"{server} not tried: a session would end that of the robot that runs",
                       "see `status` of this home")
         return
+    metrics.require_free(config.monitor)
+    yield ok("robot", "does not run; its ports are free")
     if secret is None:
         yield skipped("server", f"{server} not tried: a session needs the robot's keys", "give --passphrase-file")
         return
@@ -350,24 +280,28 @@ def reader_nodes(home: ReaderHome, secret: bytes | None) -> Findings:
     from rosbridge_eth.ledger import Ledger
 
     config = load_reader_config(home.config)
-    for url in config.chain:
+
+    def look(url: str, secret: bytes | None) -> Findings:
         with closing(Ledger.connect(url, config)) as ledger:
-            yield from examine({"node": lambda ledger, _: chain(ledger)}, ledger, secret)
+            ledger.check()
+            head = ledger.block()
+            yield from node_found(ledger.url, head.number, time.time() - head.time)
+
+    for url in config.chain:
+        yield from examine({"node": look}, url, secret)
 
 
-_MACHINE: dict[str, Check] = {"clock": clock, "home": files, "disk": disk}
+_MACHINE: dict[str, Check] = {"clock": clock, "key files": files, "disk": disk}
 CHECKS: dict[HomeKind, tuple[type[Home], dict[str, Check]]] = {
     HomeKind.OPERATOR: (OperatorHome, _MACHINE | {
         "configuration": operator_configuration,
         "certificates": lambda home, _: certificates(home.path / "ca", ""),
         "server's certificates": lambda home, _: certificates(
             home.server, f"run `renew --home {home.path}`, then start the server again"),
-        "passphrase": operator_passphrase, "ports": shards, "registry": registry, "store": store,
-        "node": operator_node,
+        "passphrase": operator_passphrase, "server": operations,
     }),
     HomeKind.ROBOT: (RobotHome, _MACHINE | {
-        "configuration": bridge, "certificates": robot_certificates, "readers": readers, "source": source,
-        "server": session,
+        "configuration": bridge, "certificates": robot_certificates, "readers": readers, "server": session,
     }),
     HomeKind.READER: (ReaderHome, _MACHINE | {"keys": own_keys, "node": reader_nodes}),
 }  # fmt: skip
@@ -390,9 +324,6 @@ def doctor(
     """
     kind = kind_of(home)
     file = passphrase or passphrase_file(kind)
-    if file is None and kind is HomeKind.OPERATOR:
-        with suppress(BridgeError):  # a configuration that cannot be read is a finding, and told below
-            file = load_server_config(OperatorHome(home).config).passphrase_file
     secret = None if file is None else read_passphrase(kind, "", file=file)
     findings, (of, checks) = list[Finding](), CHECKS[kind]
     for finding in examine(checks, of(home), secret):

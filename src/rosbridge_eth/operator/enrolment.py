@@ -7,11 +7,9 @@ step that spans the registry, a file and the chain is ordered so that it can be 
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 import socket
 import sqlite3
-import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
@@ -27,7 +25,7 @@ from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreEr
 from rosbridge_eth.files import read_file, write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, check_name
 from rosbridge_eth.ledger import Keyring, Ledger, Standing
-from rosbridge_eth.ledger.contract import BALANCE_LIMIT, WEI_PER_ETH
+from rosbridge_eth.ledger.contract import WEI_PER_ETH
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted
 from rosbridge_eth.log.chunk import MAX_READERS, robot_id
 from rosbridge_eth.log.store import NOWHERE, Store
@@ -36,74 +34,55 @@ from rosbridge_eth.operator.registry import OWNER, Registry
 from smcrypto import InvalidKey, sm2
 
 from rosbridge_eth.config.home import (  # isort: skip
-    BridgeEnd, Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, new_home, require_empty,
+    SERVER, BridgeEnd, Deployment, HomeKind, OperatorHome, ReaderHome, home_of, make_home, new_home, require_empty,
 )  # fmt: skip
 
 OPERATOR = "operator"  # what the treasury's account is called
-ACCOUNTS_TRIED = 1000
 HANDING_OVER = 2.0  # seconds after which no session of a name out of force is left: the server looks every second
 SUCCESSION = 60.0  # seconds for what the old robot handed over to be confirmed
 LAST_WRITES = 20.0  # the same, where a robot is revoked and not replaced: then its right ends all the same
-_ANYWHERE = {"0.0.0.0": socket.AF_INET, "::": socket.AF_INET6}  # noqa: S104 - what is looked for
-_SIOCGIFADDR = 0x8915  # netdevice(7)
+_ANYWHERE = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # noqa: S104 - what is looked for; a far address
 
 
 # The home
 
 
 def own_address(listen: Address) -> Address:
-    """Where others reach a socket that listens there: `listen`, or for any address the one of the default route, that
-    of another interface, and last the loopback's."""
-    family = _ANYWHERE.get(listen.host)
-    if family is None:
+    """Where others reach a socket that listens there: `listen`, or for any address that of the default route, and
+    without one the loopback's."""
+    if (far := _ANYWHERE.get(listen.host)) is None:
         return listen
-    loopback, far = ("127.0.0.1", "192.0.2.1") if family == socket.AF_INET else ("::1", "2001:db8::1")
-    with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        with suppress(OSError):
-            probe.connect((far, 9))  # sends nothing; chooses the route
-            return listen._replace(host=probe.getsockname()[0])
-        for _, name in socket.if_nameindex() if family == socket.AF_INET else ():
-            with suppress(OSError):  # of an interface without an address
-                answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
-                if answer[20] != 127:
-                    return listen._replace(host=socket.inet_ntoa(answer[20:24]))
-    return listen._replace(host=loopback)
+    with socket.socket(listen.family, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        probe.connect((far, 9))  # sends nothing; chooses the route
+        return listen._replace(host=probe.getsockname()[0])
+    return listen._replace(host="::1" if ":" in listen.host else "127.0.0.1")
 
 
-def server_toml(
-    listen: Address, public: Address, chain_url: str, name: str, passphrase_file: Path | None
-) -> str:
+def server_toml(listen: Address, public: Address, chain_url: str) -> str:
     """The first server.toml of a home: what differs from the defaults, and where the rest is described."""
-    lines = [
-        "# Settings of the server; docs/configuration.md describes every key.",
-        f'listen = "{listen}"',
-        f'public = "{public}"  # the address robots are given' if public.port else '# public = "HOST:PORT"',
-        f'name = "{name}"',
-        *([f'passphrase_file = "{passphrase_file.absolute()}"'] if passphrase_file else []),
-        "",
-        "[chain]",
-        f'url = "{chain_url}"',
-    ]
-    return "\n".join(lines) + "\n"
+    told = f'public = "{public}"  # the address robots are given' if public.port else '# public = "HOST:PORT"'
+    return (
+        "# Settings of the server; docs/configuration.md describes every key.\n"
+        f'listen = "{listen}"\n{told}\n\n[chain]\nurl = "{chain_url}"\n'
+    )
 
 
 def init_home(
     home: OperatorHome, passphrase: bytes, *, reader: ReaderHome, reader_passphrase: bytes, now: datetime,
     listen: str = "0.0.0.0:7410", public: str | None = None, chain_url: str = "http://127.0.0.1:8545",
-    server: str = "server", ca: Path | None = None, ca_passphrase: bytes | None = None, keys: Keyring | None = None,
-    passphrase_file: Path | None = None,
-) -> Keyring:
+    ca: Path | None = None, ca_passphrase: bytes | None = None, keys: Keyring | None = None,
+) -> Keyring:  # fmt: skip
     """Make an operator's home: CA, server's identity, seed of the accounts; and the reader `owner` in its own folder.
 
     ca: the folder of the CA, which is made there unless it holds one (`ca.key.pem`, `ca.crt.pem`); without it, in the
-    home. ca_passphrase: where it differs. keys: instead of a new seed. passphrase_file: is named in server.toml.
+    home. ca_passphrase: where it differs. keys: instead of a new seed.
     """
     require_empty(home.path)
     require_empty(reader.path)
     try:
         address = parse_address(listen)
         told = own_address(address) if public is None else parse_address(public)
-        text = server_toml(address, told, chain_url, server, passphrase_file)
+        text = server_toml(address, told, chain_url)
     except ValueError as error:
         raise ConfigError(f"the address {error}") from error
     parse_config(ServerConfig, text, home.config)
@@ -117,7 +96,7 @@ def init_home(
         keys = keys or Keyring.create()
         keys.save(home.accounts, passphrase)
         with Registry(home.registry, new=True) as registry:
-            identity = ids.enrol(authority, Role.SERVER, server, at=now)
+            identity = ids.enrol(authority, Role.SERVER, SERVER, at=now)
             ids.save_identity(home.server, identity, [authority.certificate], passphrase)
             registry.enrol(identity.public, now)
             _make_reader(home, reader, OWNER, authority, reader_passphrase, now, registry)
@@ -153,10 +132,9 @@ def renew_server(home: OperatorHome, *, ca: CertificateAuthority, passphrase: by
     """
     made = home.path / ".server.new"
     shutil.rmtree(made, ignore_errors=True)  # left by an attempt that was cut short
-    names = (f"server.until-{now:%Y%m%dT%H%M%SZ}{suffix}" for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
-    old = next(home.path / name for name in names if not (home.path / name).exists())
+    old = home.path / f"server.until-{now:%Y%m%dT%H%M%S.%fZ}"
     with Registry(home.registry) as registry:
-        identity = ids.enrol(ca, Role.SERVER, load_server_config(home.config).name, at=now)
+        identity = ids.enrol(ca, Role.SERVER, SERVER, at=now)
         ids.save_identity(made, identity, [ca.certificate], passphrase)
         if home.server.exists():
             home.server.rename(old)
@@ -302,14 +280,12 @@ def _make_reader(
 class Registered(NamedTuple):
     """A robot that was registered: its account, the block, the bundle's file.
 
-    unfunded: why its account was given no ETH, if it was not; the server gives it some later. buried: chunks of the one
-    that bore the name before which became dead letters. readers: for whom the robot seals.
+    buried: chunks of the one that bore the name before which became dead letters. readers: for whom the robot seals.
     """
 
     account: str
     block: int
     bundle: Path
-    unfunded: str | None
     buried: int
     readers: Sequence[str]
 
@@ -338,7 +314,7 @@ def register_robot(
         raise IdentityError(f"the request is of {request.name!r}, not of {name!r}; register it under its own name")
     there = home.deployment()
     servers = [str(address) for address in config.addresses()]
-    end = BridgeEnd(name, config.name, servers, there.chain_id, there.genesis, there.contract)
+    end = BridgeEnd(name, SERVER, servers, there.chain_id, there.genesis, there.contract)
     with Registry(home.registry) as registry:
         [standing] = ledger.standings([tk])
         if not replace:
@@ -378,15 +354,10 @@ def register_robot(
     made = Bundle(end, text, readers, private).signed(ca.key)
     path = home.bundles / f"{name}.bundle"
     write_atomically(path, made.encode(password), mode=0o600 if made.keys else 0o644)
-    unfunded = None
-    try:
-        if (has := ledger.balance(account)) < int(config.funds.below * WEI_PER_ETH):  # its first chunk need not wait
-            ledger.alloc_eth(keys.operator, account, min(int(config.funds.by * WEI_PER_ETH), BALANCE_LIMIT - has))
-    except OutOfFunds:
-        unfunded = "the operator's account has none for it"
-    except ChainError as error:
-        unfunded = str(error)
-    return Registered(account, block, path, unfunded, buried, sorted(readers))
+    with suppress(ChainError):  # then the server gives it some with its first chunk
+        if ledger.balance(account) < int(config.funds.below * WEI_PER_ETH):
+            ledger.alloc_eth(keys.operator, account, int(config.funds.by * WEI_PER_ETH))
+    return Registered(account, block, path, buried, sorted(readers))
 
 
 def _register(
@@ -394,18 +365,15 @@ def _register(
 ) -> tuple[int, str, int]:
     """Register on the chain with the next account that serves no other robot: number, account and block."""
     put = ledger.registration if standing.account is None else ledger.replace_registration
-    first = registry.next_number()
-    for number in range(first, first + ACCOUNTS_TRIED):
+    number = registry.next_number()
+    while True:
         account = keys.account(number).address
         try:
             return number, account, put(keys.operator, tk, account, certificates).block
         except Reverted as refused:
             if refused.name != "AccountInUse":  # by a robot that a registry from an older backup does not know
                 raise
-    raise StoreError(
-        f"the contract knows the accounts {first} to {first + ACCOUNTS_TRIED - 1} of this home and the registry does"
-        " not: restore registry.sqlite from a newer backup"
-    )
+            number += 1
 
 
 def _waiting(inbox: Callable[[], Store], tk: bytes, patience: float, pause: Callable[[float], None]) -> int:
@@ -455,12 +423,12 @@ def revoke(
     with Registry(home.registry) as registry:
         known = any(enrolment.name == name for enrolment in registry.all(role))
         in_force = registry.revoke(role, name, now)
-    nobody = f"{role} {name!r} was revoked already" if known else f"no {role} {name!r} is enrolled; `status` lists them"
+    nobody = IdentityError(f"no {role} {name!r} is in force; `status` lists them")
     if role is not Role.ROBOT:
         if known and role is Role.READER:  # also where it was cut short before
             (home.readers / f"{name}.pem").unlink(missing_ok=True)
         if not in_force:
-            raise IdentityError(nobody)
+            raise nobody
         return Revoked(None)
     tk = robot_id(name)
     try:
@@ -468,12 +436,12 @@ def revoke(
         [standing] = ledger.standings([tk])
         ended = standing.account is None or standing.revoked
         if ended and not known:
-            raise IdentityError(nobody)
+            raise nobody
         if in_force or not ended:
             _waiting(inbox, tk, 0.0 if compromised or ended else LAST_WRITES, pause)
         buried = _bury(inbox, ledger, tk, f"{name} was revoked")
         if ended and not in_force and not buried:
-            raise IdentityError(nobody)
+            raise nobody
         return Revoked(None if ended else ledger.revoke_robot(keys.operator, tk).block, buried)
     except (ChainError, StoreError) as error:
         raise type(error)(

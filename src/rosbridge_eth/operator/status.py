@@ -1,7 +1,8 @@
 """`status`: what is where, by a home: who is enrolled, connected, waiting or on hold, and what the chain has.
 
-It asks registry, store, node and the figures of the running server or robot; whatever of them is not there, the rest is
-shown, and a sentence says what is not known and why. Nothing is changed or made.
+It asks registry, store, node and the figures of the running server or robot. Where one of them does not answer, the
+rest is shown, and `unknown` says what is missing; `alarms` is what somebody has to see to. Both are (what, sentence),
+which `doctor` tells, too. Nothing is changed or made.
 """
 
 from __future__ import annotations
@@ -30,21 +31,18 @@ from rosbridge_eth.robot.spool import Spool
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, plain, print_json, table, talk
 
 if TYPE_CHECKING:
-    from rosbridge_eth.ledger import Ledger, Standing
+    from rosbridge_eth.ledger import Ledger
     from rosbridge_eth.server.metrics import Figure
 
 _WEI: Final = 10**18
 ANSWER_TIME = 5.0  # seconds for a node or a monitor
-SPENDING_BLOCKS = 100  # what an account spends is seen by its balance so many blocks ago: geth keeps 128 states
 SEEN = 15.0  # seconds since a worker last saw the session
-FOLLOW_EVERY = 2.0
 DEAD = 1000  # dead letters; the store keeps no more
 Report = dict[str, Any]
 TOO_OLD = 120.0  # seconds that a chunk waits to be confirmed, before it is an alarm
-FEW_DAYS = 7.0
 FORKED_FOR = 600.0  # seconds for which it is told that a log went on in two places
-_NO_SERVER = "the server does not run here: who is connected, rates and gas are not known"
 _SILENT = "what uses the spool shows no figures: what is captured, and whether there is a session, is not known"
+NO_SERVER = ("server", "it does not run here: who is connected, rates and gas are not known")
 _OF_ROBOT = {"records_per_second": "rate", "newest_chunk_seconds": "newest", "gas": "gas", "chain_chunks": "chunks",
              "chain_block": "block", "on_hold": "hold", "waiting_chunks": "chunks", "waiting_seconds": "oldest"}
 """The server's figures of a robot, and what they are called here."""
@@ -58,23 +56,20 @@ def _asking(report: Report, what: str) -> Iterator[None]:
     except NothingThere:
         pass
     except BridgeError as error:
-        report["unknown"].append(f"{what}: {error}")
+        report["unknown"].append((what, str(error)))
 
 
-def _running(report: Report, home: Path, otherwise: str) -> list[Figure]:
-    """What the processes of this home show; in the report, those that were killed and the conditions that do not hold.
-
-    otherwise: said where none of them is there.
-    """
+def _running(report: Report, home: Path) -> list[Figure]:
+    """What the processes of this home show; in the report, those that were killed and the conditions that do not hold,
+    and None without a process."""
     from rosbridge_eth.server import metrics
 
     found = metrics.running(home)
-    if not any(found.values()):
-        report["unknown"].append(otherwise)
     report["process"] = [
         failing for process, figures in found.items()
         for failing in ([f"{process} runs"] if figures is None else metrics.failing(figures))
     ] if found else None  # fmt: skip
+    report["alarms"] += [("not ready", f"{failing}: no") for failing in report["process"] or ()]
     return [figure for figures in found.values() for figure in figures or ()]
 
 
@@ -95,7 +90,7 @@ def _add_figures(report: Report, figures: Collection[Figure]) -> None:
             of[_OF_ROBOT[name]] = max(0.0, now - value) if name == "newest_chunk_seconds" else value
 
 
-def _operator(place: OperatorHome, name: str | None = None) -> Report:
+def of_operator(place: OperatorHome, name: str | None = None) -> Report:
     """name: of the only robot that is looked at, and how far its log is on the chain."""
     from rosbridge_eth.ledger import Ledger
 
@@ -114,44 +109,47 @@ def _operator(place: OperatorHome, name: str | None = None) -> Report:
         ],
         "robots": {each.name: {"account": each.account, "in_force": each.revoked_at is None}
                    for each in robots.values()},
-        "operator": {"account": place.account, "eth": None, "days_left": None}, "contract": None, "node": None,
-        "gas_per_day": config.funds.gas_per_day, "dead": [], "unknown": [],
+        "operator": {"account": place.account, "eth": None}, "contract": None, "node": None,
+        "dead": [], "alarms": [], "unknown": [],
     }  # fmt: skip
-    _add_figures(report, _running(report, place.path, _NO_SERVER))
-    with _asking(report, "the contract"):
+    _add_figures(report, _running(report, place.path))
+    if report["process"] is None:
+        report["unknown"].append(NO_SERVER)
+    with _asking(report, "contract"):
         deployment = place.deployment()
         report |= {"contract": deployment.contract, "chain": deployment.chain_id}
-        with _asking(report, "what waits"):
+        with _asking(report, "store"):
             _add_inbox(report, place, config, robots)
-        with _asking(report, "the chain"), closing(
+        with _asking(report, "node"), closing(
             Ledger.connect(config.chain.url, deployment, timeout=ANSWER_TIME)
         ) as ledger:
             head = ledger.block()
-            age = max(0.0, time.time() - head.time)
-            report["node"] = {"url": ledger.url, "block": head.number, "age_seconds": age}
+            report["node"] = {"url": ledger.url, "block": head.number, "age_seconds": time.time() - head.time}
             try:
                 ledger.check()
             except ChainError as error:
                 report["wrong_chain"] = str(error)
                 raise
-            _add_standings(report, ledger, enrolled, robots, round(config.funds.by * _WEI))
+            _add_standings(report, ledger, enrolled, robots)
+            _add_account(report, ledger, config.funds.by)
             if name is not None:
                 report["robots"][name]["log"] = _log(ledger, tk, head.number - config.chain.confirmations + 1)
-    report["alarms"] = [*_alarms(report)]
+    _add_alarms(report)
     return report
 
 
 def fleet(place: OperatorHome) -> RenderableType:
     """The picture of a running server at its terminal, from its own figures alone."""
-    report: Report = {"robots": {}, "unknown": [], "dead": []}
+    report: Report = {"robots": {}, "dead": [], "alarms": []}
     try:
         with Registry(place.registry) as registry:
             report["robots"] = {robot.name: {"in_force": True} for robot in registry.robots().values()
                                 if robot.revoked_at is None}  # fmt: skip
     except BridgeError as error:  # of a file that is changed at this moment
         return plain(str(error))
-    _add_figures(report, _running(report, place.path, _NO_SERVER))
-    return Group(_robots(report, money=False), *map(Text, _alarms(report)))
+    _add_figures(report, _running(report, place.path))
+    _add_alarms(report)
+    return Group(_robots(report), *map(plain, _alarms(report)))
 
 
 def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots: Mapping[bytes, Enrolment]) -> None:
@@ -168,44 +166,35 @@ def _add_inbox(report: Report, place: OperatorHome, config: ServerConfig, robots
                 robot |= {"waiting": waiting._asdict() | {"oldest": oldest}, "hold": hold}
             reasons.update((letter.tk, letter.why) for letter in store.dead(DEAD)
                            if shard_of(letter.tk, config.shards) == shard)
+            store.check()
     report["dead"] = [{"robot": names.get(tk, tk.hex()), "why": why, "chunks": count}
                       for (tk, why), count in reasons.items()]  # fmt: skip
 
 
 def _add_standings(
-    report: Report, ledger: Ledger, enrolled: Sequence[Enrolment], robots: Mapping[bytes, Enrolment], top_up: int
+    report: Report, ledger: Ledger, enrolled: Sequence[Enrolment], robots: Mapping[bytes, Enrolment]
 ) -> None:
-    """What the chain has of each robot, what it says otherwise than the registry, and how long the robots' accounts and
-    the operator's last at what robots spent lately.
-
-    top_up: wei that an account is given at once. One that has more than before was given that.
-    """
-    head, seconds, total, operator = report["node"]["block"], 0, 0, report["operator"]
-    before: dict[bytes, Standing] = {}
-    treasury = ledger.balance(operator["account"])
-    operator["eth"] = treasury / _WEI
+    """What the chain has of each robot, and what it says otherwise than the registry."""
     standings = dict(zip(robots, ledger.standings([*robots]), strict=True))
-    report["differences"] = differences(enrolled, standings)
-    block = max(1, head - SPENDING_BLOCKS)
-    try:
-        before = dict(zip(robots, ledger.standings([*robots], block), strict=True))
-        seconds = ledger.block_time(head) - ledger.block_time(block)
-    except ChainError:
-        report["unknown"].append(
-            f"how long accounts last: not known, as the node does not have the balances of block {block} (geth keeps"
-            " those of the last 128 blocks, anvil none from before its last start)"
-        )
+    report["alarms"] += differences(enrolled, standings).items()
     for tk, now in standings.items():
-        robot, known = robots[tk], before.get(tk)
-        less = known.balance - now.balance if known is not None and known.account == now.account else 0
-        spent = less if less >= 0 else less % top_up
-        total += spent
-        report["robots"][robot.name] |= {
+        report["robots"][robots[tk].name] |= {
             "chunks": now.chunks, "block": now.data_block, "eth": now.balance / _WEI,
-            "days_left": _days(now.balance, spent, seconds), "revoked_on_chain": now.revoked,
-            "in_force": robot.revoked_at is None and not now.revoked,
+            "revoked_on_chain": now.revoked, "in_force": robots[tk].revoked_at is None and not now.revoked,
         }  # fmt: skip
-    operator["days_left"] = _days(treasury, total, seconds)
+
+
+def _add_account(report: Report, ledger: Ledger, top_up: float) -> None:
+    """Whether the operator's account is the contract's, and can pay the next top-up."""
+    account = report["operator"]["account"]
+    eth = report["operator"]["eth"] = ledger.balance(account) / _WEI
+    if (operator := ledger.operator()) != account:
+        report["alarms"].append((
+            "operator", f"the contract's is {operator}, this home's {account}: use the home of that account, or let it"
+            " offer the contract, and take it over (`handover`)"))  # fmt: skip
+    if eth < top_up:
+        report["alarms"].append((
+            "treasury", f"{account} has {eth:.4f} ETH, and a top-up takes {top_up:g}: send ETH to it"))  # fmt: skip
 
 
 def _log(ledger: Ledger, tk: bytes, confirmed: int) -> dict[str, Report | None]:
@@ -222,31 +211,26 @@ def _log(ledger: Ledger, tk: bytes, confirmed: int) -> dict[str, Report | None]:
     return log
 
 
-def _days(balance: float, spent: int, seconds: int) -> float | None:
-    return balance / spent * seconds / 86_400 if spent > 0 and seconds > 0 else None
-
-
-def _alarms(report: Report) -> Iterator[str]:
-    """What somebody has to see to."""
-    for condition in report["process"] or ():
-        yield f"ALARM: the server is not ready: {condition}: no"
-    for name, difference in report.get("differences", {}).items():
-        yield f"ALARM: {name}: {difference}"
+def _add_alarms(report: Report) -> None:
+    """What somebody has to see to about robots."""
     for name, robot in report["robots"].items():
         if hold := robot.get("hold"):
-            yield f"ALARM: {name} is on hold" + (f": {hold}." if isinstance(hold, str) else "; `status` says why.")
+            why = f"it is on hold: {hold}" if isinstance(hold, str) else "it is on hold; `status` says why"
+            report["alarms"].append((name, why))
         if robot.get("forked"):
-            yield f"ALARM: {name}: {FORKED}"
+            report["alarms"].append((name, FORKED))
         if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
-            yield f"ALARM: a chunk of {name} has waited {span(oldest)} to be confirmed"
-    for each in report["dead"]:
-        yield f"ALARM: dead letters, {counted(each['chunks'], 'chunk')} of {each['robot']}: {each['why']}"
-    days = report.get("operator", {}).get("days_left")
-    if days is not None and days < FEW_DAYS:
-        yield f"ALARM: the operator's account, from which robots are paid, lasts {days:.1f} days"
+            report["alarms"].append((name, f"a chunk has waited {span(oldest)} to be confirmed"))
+    report["alarms"] += [
+        (each["robot"], f"dead letters, {counted(each['chunks'], 'chunk')}: {each['why']}") for each in report["dead"]
+    ]
 
 
-def _robot(place: RobotHome) -> Report:
+def _alarms(report: Report) -> list[str]:
+    return [f"ALARM: {what}: {said}" for what, said in report["alarms"]]
+
+
+def of_robot(place: RobotHome) -> Report:
     end, config = place.bridge(), load_robot_config(place.config)
     report: Report = {
         "robot": end.robot, "server": f"{end.server_name} at {config.server or end.addresses()[0]}",
@@ -254,16 +238,18 @@ def _robot(place: RobotHome) -> Report:
         "contract": end.contract, "chain": end.chain_id, "runs": False, "spool": None, "process": None, "alarms": [],
         "unknown": [],
     }  # fmt: skip
-    with _asking(report, "the spool"):
+    with _asking(report, "spool"):
         log = Log(end.ledger, robot_id(end.robot))
         try:
             with closing(Spool(place.spool, log, max_bytes=1, drop=lambda chunk: chunk, read_only=True)) as spool:
                 report["spool"] = spool.statistics()._asdict()
         except InUse:
             report["runs"] = True
-            running = _running(report, place.path, _SILENT)
-            seen = [value for name, _, value in running if name == "forked_seconds"]
-            report["alarms"] = [f"ALARM: {FORKED}" for value in seen if time.time() - value < FORKED_FOR]
+            running = _running(report, place.path)
+            if not running:
+                report["unknown"].append(("robot", _SILENT))
+            report["alarms"] += [("log", FORKED) for name, _, value in running
+                                 if name == "forked_seconds" and time.time() - value < FORKED_FOR]  # fmt: skip
             report["figures"] = _of_robot(running)
     return report
 
@@ -300,42 +286,36 @@ def _process(report: Report) -> list[tuple[str, object]]:
     return [] if failing is None else [("process", "NOT READY: " + ", ".join(failing) if failing else "ready")]
 
 
-def _robots(report: Report, *, money: bool = True) -> RenderableType:
-    """money: what accounts have, too; then addresses have no room, and stand below."""
-    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas"], []
+def _robots(report: Report) -> RenderableType:
+    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas", "ETH"], []
     for name, robot in report["robots"].items():
-        waiting, session = robot.get("waiting", {}), {None: "?", False: "no"}.get(robot.get("connected"))
+        waiting, session = robot.get("waiting", {}), {None: "?", False: "no", True: "yes"}[robot.get("connected")]
         oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
         rows.append((
-            name, (session or ("yes" if money else robot["address"])) if robot["in_force"] else "revoked",
-            span(robot.get("newest")),
+            name, session if robot["in_force"] else "revoked", span(robot.get("newest")),
             _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
             _figure(robot, "chunks", ".0f"), _figure(robot, "block", ".0f"),
-            f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?",
-            *([_figure(robot, "eth", ".4f"), _figure(robot, "days_left", ".1f")] if money else []),
+            f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?", _figure(robot, "eth", ".4f"),
         ))  # fmt: skip
     title = "Robots: chunks that wait (how long) and that are on the chain, up to a block"
-    return table(title, [*columns, *(["ETH", "days"] if money else [])], rows, right=range(2, 10))
+    return table(title, columns, rows, right=range(2, 9))
 
 
 def _figure(of: Mapping[str, Any], key: str, form: str) -> str:
-    """A number, a question mark where it is not known, nothing where there is none."""
-    return "?" if key not in of else "" if of[key] is None else format(of[key], form)
+    """A number, or a question mark where it is not known."""
+    return format(of[key], form) if key in of else "?"
 
 
 def _show_operator(report: Report) -> Iterator[RenderableType]:
     yield _robots(report)
-    eth, days, contract = report["operator"]["eth"], report["operator"]["days_left"], report["contract"]
-    node = report["node"]
-    head = f"{node['block']}, {span(node['age_seconds'])} old, at {node['url']}" if node else "not known"
+    eth, node = report["operator"]["eth"], report["node"]
+    head = f"{node['block']}, {span(max(0.0, node['age_seconds']))} old, at {node['url']}" if node else "not known"
     others = [f"{each['role']} {each['name']}" for each in report["names"]
               if each["role"] != Role.ROBOT and each["revoked"] is None]  # fmt: skip
-    treasury = "not known" if eth is None else f"{eth:.4f} ETH" + (f", for {days:.1f} days" if days is not None else "")
     yield table("Server", ["what", "value"], [
-        ("contract", contract or "none yet; run `deploy`"), ("chain", report.get("chain", "")), ("last block", head),
-        ("treasury", treasury),
-        ("budget", f"{report['gas_per_day'] / 1e6:.0f} Mgas a robot and day"), ("also in force", ", ".join(others)),
-        *_process(report),
+        ("contract", report["contract"] or "none yet; run `deploy`"), ("chain", report.get("chain", "")),
+        ("last block", head), ("treasury", "not known" if eth is None else f"{eth:.4f} ETH"),
+        ("also in force", ", ".join(others)), *_process(report),
     ])  # fmt: skip
     for name, robot in report["robots"].items():
         for state, place in robot.get("log", {}).items():
@@ -343,7 +323,7 @@ def _show_operator(report: Report) -> Iterator[RenderableType]:
                 f"up to chunk {place['number']} of stream {place['stream']}, in block {place['block']},"
                 f" transaction {place['transaction']}"
             ))  # fmt: skip
-    yield from report["alarms"]
+    yield from _alarms(report)
     for name, each in {"operator": report["operator"], **report["robots"]}.items():
         if each["account"]:
             yield f"{each['account']}  {name}"  # whole lines, to be copied
@@ -363,7 +343,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("spool", kept), *_process(report),
         *_rows(report.get("figures", {})),
     ])  # fmt: skip
-    yield from report["alarms"]
+    yield from _alarms(report)
 
 
 def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
@@ -371,11 +351,11 @@ def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
     kind = kind_of(path)
     match kind:
         case HomeKind.OPERATOR:
-            shown = _show_operator(report := _operator(OperatorHome(path), robot))
+            shown = _show_operator(report := of_operator(OperatorHome(path), robot))
         case HomeKind.ROBOT:
             if robot is not None:
                 raise ConfigError(f"{path} is the home of one robot; leave its name out")
-            shown = _show_robot(report := _robot(RobotHome(path)))
+            shown = _show_robot(report := of_robot(RobotHome(path)))
         case HomeKind.READER:
             raise ConfigError(f"{path} is a reader's home, which has no status; run `doctor --home {path}`")
     return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
@@ -383,30 +363,20 @@ def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
 
 def status(
     robot: Annotated[str | None, typer.Argument(help="This one alone, and how far its log is on the chain.")] = None,
-    home: AnyHomeOption = OPERATOR_HOME,
-    follow: Annotated[bool, typer.Option("--follow", help="Look again every two seconds, until Ctrl-C.")] = False,
-    json: Json = False,
-) -> None:
+    home: AnyHomeOption = OPERATOR_HOME, json: Json = False,
+) -> None:  # fmt: skip
     """Show the state: robots, waiting chunks, balances, alarms. Of an operator's home, or a robot's.
 
     What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
     another chain than the contract.
     """
-    from rich.live import Live
-
     report, shown = _look(home, robot)
-    if follow and not json:
-        with Live(console=data, auto_refresh=False) as live:
-            while True:
-                live.update(Group(*shown, *map(Text, report["unknown"])), refresh=True)
-                time.sleep(FOLLOW_EVERY)
-                report, shown = _look(home, robot)
     if json:
         print_json(report)
     else:
         for each in shown:
             data.print(each, soft_wrap=isinstance(each, Text))
-        for line in report["unknown"]:
-            talk(line)
+        for what, said in report["unknown"]:
+            talk(f"{what}: {said}")
     if "wrong_chain" in report:
         raise ChainError(report["wrong_chain"])

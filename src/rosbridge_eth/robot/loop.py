@@ -30,7 +30,7 @@ from rosbridge_eth.config.home import RobotHome
 from rosbridge_eth.config.values import Address, counted, parse_address
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
-from rosbridge_eth.log.chunk import STREAM_SIZE, Chunk, Log, drop, robot_id
+from rosbridge_eth.log.chunk import MAX_READERS, STREAM_SIZE, Chunk, Log, drop, robot_id
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
@@ -334,13 +334,19 @@ def keep_time(home: RobotHome, seconds: float) -> None:
         log.warning("the server's time cannot be kept for the next start: %s", error.strerror)
 
 
-def reader_keys(config: RobotConfig, home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
+def reader_keys(home: RobotHome, roots: Sequence[x509.Certificate]) -> list[sm2.PublicKey]:
     """The encryption keys of everybody who may read. Each file holds a reader's two certificates, signing first.
 
     One whose certificates have ended is left out, and named in the log; ConfigError where nobody is left.
     """
     trust, keys, now = Trust(roots), [], certificate_clock(home)()
-    for path in config.reader_files(home.readers):
+    files = sorted(home.readers.glob("*.pem"))
+    if not 1 <= len(files) <= MAX_READERS:
+        raise ConfigError(
+            f"{home.readers} has the certificates of {len(files)} readers, and a chunk is for 1 to {MAX_READERS}: join"
+            " again with the bundle, or correct the folder"
+        )
+    for path in files:
         found = read_certificates(path.read_bytes())
         if len(found) != 2:
             raise ConfigError(f"{path} holds {len(found)} certificates; a reader has two, signing and encryption")
@@ -360,7 +366,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
     """The robot of this home, ready to `run`. Raises ConfigError, IdentityError, SourceError, StoreError."""
     end = home.bridge()
     identity, roots = load_identity(home.identity, password)
-    readers = reader_keys(config, home, roots)
+    readers = reader_keys(home, roots)
     settings, _ = config.source_and_why(os.environ)
     source = open_source(settings, Selection.of(config))
     capture = Capture(config.rules(), source_kind=source.kind, live=source.live)
@@ -395,16 +401,15 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
 
 def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConfig:
     """Reload robot.toml and the readers, without losing a message: topics, nodes, triggers,
-    [capture] and readers; of a bag or a simulation, which was chosen from at the start, the last two. What holds from
-    now on.
+    and readers; of a bag or a simulation, which was chosen from at the start, readers alone. What holds from now on.
 
     What cannot be used is told, and nothing changes.
     """
-    keys = [*(("topics", "nodes", "trigger") if robot.source.live else ()), "capture", "readers"]
+    keys = ("topics", "nodes", "trigger") if robot.source.live else ()
     try:
         config, said = reread(running, load_robot_config(home.config), keys)
         roots = read_certificates((home.identity / "ca.crt.pem").read_bytes())
-        robot.reload(config, reader_keys(config, home, roots))
+        robot.reload(config, reader_keys(home, roots))
     except (BridgeError, OSError) as error:
         log.error("nothing is reloaded: %s", error)
         return running

@@ -193,9 +193,8 @@ def topics(
     if source is not None:
         named = parse_config(RobotConfig, robot_toml(["**"], source), place.config).source
         config = config.model_copy(update={"source": named})
-    joined = config.readers or [*place.readers.glob("*.pem")]
-    report = survey(config, seconds, len(config.reader_files(place.readers)) if joined else 1,
-                    () if configured else PLUMBING)
+    readers = len([*place.readers.glob("*.pem")]) or 1
+    report = survey(config, seconds, readers, () if configured else PLUMBING)
     if json:
         print_json(report)
         return

@@ -21,7 +21,7 @@ from rosbridge_eth.config import (
 )
 from rosbridge_eth.config.models import SOURCE_KINDS
 from rosbridge_eth.errors import ConfigError
-from rosbridge_eth.log.chunk import MAX_READERS, ledger_id
+from rosbridge_eth.log.chunk import ledger_id
 
 S = 10**9
 FILE = Path("/etc/rosbridge/robot.toml")
@@ -78,13 +78,10 @@ topics = [
     { topic = "/b", for = "2s", once = true },
     { topic = "/c/*", at = 1970-01-01T00:00:03Z },
 ]
-[capture]
-field_limit = "2 KiB"
 """
     )
     rules = {rule.topic: rule for rule in config.rules()}
     assert list(rules) == ["/robot_1/imu", "/robot_1/odom", "/a", "/b", "/c/*", "**"]
-    assert all(rule.limit == 2048 for rule in rules.values())
     odom = rules["/robot_1/odom"]
     assert (odom.fields, odom.rate) == (("pose.pose.position",), 2)
     assert (rules["/a"].from_ns, rules["/a"].until_ns) == (S, 2 * S)
@@ -105,16 +102,12 @@ def test_a_bag_stands_relative_to_the_file():
 
 KINDS = ", ".join(map(repr, SOURCE_KINDS))
 MISTAKES = {
-    # The line, the key, what was given, what is allowed, and the nearest right word.
-    'topcs = ["/a"]': "unknown key 'topcs'; did you mean 'topics'?",
-    'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "unknown key 'max_sise' in spool; did you mean 'max_size'?",
-    'topics = ["/a"]\nzzz = 1': "unknown key 'zzz'; allowed: capture, channel, log, monitor, nodes, ",
-    'topics = [{topic = "/a", rat = 1}]': "unknown key 'rat' in topics[0]; did you mean 'rate'?",
-    'topics = ["/a"]\nsource = {kind = "sim", sped = 1}': "unknown key 'sped' in source; did you mean 'speed'?",
+    # The line, and the key, what was given and what is allowed.
+    'topcs = ["/a"]': "unknown key 'topcs'; docs/configuration.md has every key",
+    'topics = ["/a"]\n\n[spool]\nmax_sise = 5': "unknown key 'spool.max_sise'",
+    'topics = [{topic = "/a", rat = 1}]': "unknown key 'topics[0].rat'",
     # Of a source the keys of its kind, not those of another.
-    'topics = ["/a"]\nsource = {kind = "sim", path = "x"}': (
-        "unknown key 'path' in source; allowed: duration, kind, rate, robot, seed, speed"
-    ),
+    'topics = ["/a"]\nsource = {kind = "sim", path = "x"}': "unknown key 'source.path'",
     "": 'it names nothing to watch; write topics = ["/robot_1/odom"]',
     "topics = []": "it names nothing to watch",
     'topics = "/a"': "topics is '/a'; input should be a valid list",
@@ -133,7 +126,6 @@ MISTAKES = {
     'topics = ["/a"]\n[log]\nperiod = "49ms"': "log.period is '49ms'; it should be at least '50ms'",
     'topics = ["/a"]\n[log]\nperiod = 1': "log.period is 1; write a duration with its unit, such as",
     'topics = ["/a"]\n[log]\ncompress = "no"': "log.compress is 'no'; input should be a valid boolean",
-    'topics = ["/a"]\n[capture]\nfield_limit = "1 MiB"': "field_limit is '1 MiB'; it should be at most '48 KiB'",
     'topics = ["/a"]\n[source]\nkind = "ros1"\nmaster = "robot:11311"': "source.master is 'robot:11311'; write the",
     'topics = ["/a"]\n[source]\nkind = "ros1"\nhostname = "a:1"': "source.hostname is 'a:1'; write a name or an",
     'topics = [{topic = "/a", at = 2026-01-01T00:00:00Z, rate = 1, for = "2s"}]': (
@@ -145,7 +137,7 @@ MISTAKES = {
     ),
     'topics = [{topic = "/a", from = 2026-01-02T00:00:00}]': "say in which time zone",
     'topics = [{topic = "/a", for = 5}]': 'topics[0].for is 5; write a duration with its unit, such as "250ms"',
-    'topics = ["/a"]\nsource = 3': "source is 3; write a table",
+    'topics = ["/a"]\nsource = 3': "source is 3; input should be a valid dictionary",
     'topics = ["/a"]\n[source]\nkind = "bog"': f"source needs a kind: {KINDS}",
     'topics = ["/a"]\n[source]\nspeed = "max"': f"source needs a kind: {KINDS}",
     'topics = ["/a"]\n[source]\nkind = "ros2"\nnode = "a/b"': "source.node is 'a/b'; a node's name has letters",
@@ -162,7 +154,6 @@ MISTAKES = {
     'topics = ["/a"]\n[spool]\nmax_size = 5': "spool.max_size is 5; it should be at least '1 MiB'",
     'topics = ["/a"]\nchannel = "transprot"': "channel is 'transprot'; input should be 'exchange' or 'transport'",
     'topics = ["/a"]\nserver = "host"': "server is 'host'; write HOST:PORT",
-    'topics = ["/a"]\nreaders = []': "it has no reader: nobody could open the records",
     "topics = [": "is not TOML: ",
     "topics = 1\ntopics = 2": "is not TOML: cannot overwrite a value",
     "\x00": "is not TOML: ",
@@ -183,9 +174,9 @@ def test_a_mistake_in_robot_toml_is_told(text):
     ("text", "sentence"),
     [
         ("shards = 0", "shards is 0; input should be greater than or equal to 1"),
-        ("channel = []", "channel is empty"),
+        ("channel = []", "channel is []; list should have at least 1 item"),
         ('channel = ["foo"]', "channel[0] is 'foo'; input should be 'exchange' or 'transport'"),
-        ('[chain]\ncontract = "0x12"', "unknown key 'contract' in chain; allowed: "),
+        ('[chain]\ncontract = "0x12"', "unknown key 'chain.contract'"),
         ("[chain]\nconfirmations = true", "chain.confirmations is true; input should be a valid integer"),
         ("[chain]\nconfirmations = 101", "chain.confirmations is 101; input should be less than or equal to 100"),
         ('[chain]\nurl = "embedded"', "chain.url is not a node's URL"),
@@ -193,14 +184,12 @@ def test_a_mistake_in_robot_toml_is_told(text):
         ('listen = "a..b:7410"', "listen is 'a..b:7410'; write HOST:PORT"),
         ('[chain]\nurl = "ws://127.0.0.1:8546"', "chain.url is not a node's URL"),
         ('[store]\nshare = "1 kB"', "store.share is '1 kB'; it should be at least '1 MiB'"),
-        ('name = "Server 1"', "name is 'Server 1'; a name has 1 to 63 of a-z"),
-        ("passphrase_file = 1", "passphrase_file is 1; write a path in quotes"),
         ("[funds]\ngas_per_day = 5", "funds.gas_per_day is 5; input should be greater than or equal to 1000000"),
         ("[funds]\nby = 6", "funds.by is 6; input should be less than or equal to 5"),
         ("[funds]\nby = 4e-19", "funds.by is 4e-19; input should be greater than or equal to 0.000001"),
         ("[funds]\nbelow = 4e-19", "funds.below is 4e-19; input should be greater than or equal to 0.000001"),
         ("[store]\nurl = 3", "store.url is 3; input should be a valid string"),
-        ("[stroe]\nshare = 10", "unknown key 'stroe'; did you mean 'store'?"),
+        ("[stroe]\nshare = 10", "unknown key 'stroe'"),
     ],
 )
 def test_a_mistake_in_server_toml_is_told(text, sentence):
@@ -247,7 +236,7 @@ def test_a_reader_says_which_ledger_and_by_which_nodes():
         ("", "contract is missing; chain_id is missing; genesis is missing"),
         ('contract = "0x12"', "contract is '0x12'; an address is 0x and 40 hexadecimal digits"),
         ('genesis = "0x12"', "genesis is '0x12'; a hash is 0x and 64 hexadecimal digits"),
-        ("chain = []", "chain is empty"),
+        ("chain = []", "chain is []; list should have at least 1 item"),
         ('chain = ["http://a", "ftp://secretkey@b"]', "chain[1] is not a node's URL"),
     ],
 )
@@ -314,29 +303,6 @@ def test_files_that_cannot_be_read(tmp_path):
     good = tmp_path / "robot.toml"
     good.write_text('topics = ["/a"]')
     assert load_robot_config(good).topics[0].topic == "/a"
-
-
-def test_no_reader_is_an_error_with_the_way_out(tmp_path):
-    config = robot('topics = ["/a"]')
-    with pytest.raises(ConfigError, match="no reader: there is no certificate in"):
-        config.reader_files(tmp_path)
-    (tmp_path / "owner.pem").write_text("")
-    assert config.reader_files(tmp_path) == [tmp_path / "owner.pem"]
-    named = parse_config(RobotConfig, 'topics = ["/a"]\nreaders = ["alice.pem"]', tmp_path / "robot.toml")
-    with pytest.raises(ConfigError, match=r"alice\.pem does not exist"):
-        named.reader_files(tmp_path)
-    (tmp_path / "alice.pem").write_text("")
-    assert named.reader_files(tmp_path) == [tmp_path / "alice.pem"]
-
-
-def test_more_readers_than_a_chunk_is_for_are_told_before_anything_is_sealed(tmp_path):
-    config = robot('topics = ["/a"]')
-    for number in range(MAX_READERS):
-        (tmp_path / f"{number}.pem").write_text("")
-    assert len(config.reader_files(tmp_path)) == MAX_READERS
-    (tmp_path / "more.pem").write_text("")
-    with pytest.raises(ConfigError, match="there are 17 readers, and a chunk is for 16 at most"):
-        config.reader_files(tmp_path)
 
 
 def test_a_byte_order_mark_is_no_part_of_the_file(tmp_path):

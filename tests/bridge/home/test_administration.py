@@ -10,7 +10,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import pytest
 
 from bridge.home.world import NOW, PASSPHRASE, READER_PASSPHRASE, TK, World
 from rosbridge_eth import identity as ids
-from rosbridge_eth.config import Address, load_reader_config, load_server_config
+from rosbridge_eth.config import Address, load_reader_config
 from rosbridge_eth.config.home import HomeKind, OperatorHome, ReaderHome, RobotHome, kind_of
 from rosbridge_eth.errors import ChainError, ConfigError, IdentityError, StoreError
 from rosbridge_eth.identity import Role, load_ca, load_identity, split_certificates
@@ -53,23 +53,18 @@ def test_the_address_robots_are_given_is_a_machines_own() -> None:
         assert admin.own_address(given) == given
 
 
-def test_without_a_default_route_another_interface_is_found_and_last_the_loopback(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_a_default_route_it_is_the_loopbacks(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoRoute(socket.socket):
         def connect(self, address: object) -> None:
             raise OSError(101, "Network is unreachable")
 
     monkeypatch.setattr(socket, "socket", NoRoute)
-    found = admin.own_address(Address("0.0.0.0", 7410))
-    assert found.host not in ("0.0.0.0", "127.0.0.1") or len(socket.if_nameindex()) == 1
-    assert admin.own_address(Address("::", 7410)) == ("::1", 7410)
-    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "none")])
     assert admin.own_address(Address("0.0.0.0", 7410)) == ("127.0.0.1", 7410)
+    assert admin.own_address(Address("::", 7410)) == ("::1", 7410)
 
 
 @pytest.mark.parametrize("change", [
-    {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"}, {"server": "My Server"},
+    {"listen": "nowhere"}, {"public": "0.0.0.0"}, {"chain_url": "ws://node"},
     {"chain_url": 'http://x"\nshards = 3\n#'},
 ])
 def test_what_cannot_be_a_configuration_is_refused_before_anything_is_made(
@@ -103,16 +98,14 @@ def test_a_home_is_complete_or_none(world: World, tmp_path: Path, monkeypatch: p
     assert half.require() and ReaderHome(tmp_path / "r").require()
 
 
-def test_the_seed_of_a_mnemonic_and_a_passphrase_file_are_taken(tmp_path: Path) -> None:
+def test_the_seed_of_a_mnemonic_is_taken(tmp_path: Path) -> None:
     words = Keyring.create().mnemonic
-    home, file = OperatorHome(tmp_path / "home"), tmp_path / "pass"
-    file.write_bytes(PASSPHRASE)
+    home = OperatorHome(tmp_path / "home")
     made = admin.init_home(
         home, PASSPHRASE, reader=ReaderHome(tmp_path / "r"), reader_passphrase=READER_PASSPHRASE, now=NOW,
-        keys=Keyring.from_mnemonic(words), passphrase_file=file,
+        keys=Keyring.from_mnemonic(words),
     )
     assert Keyring.load(home.accounts, PASSPHRASE).mnemonic == words == made.mnemonic
-    assert load_server_config(home.config).passphrase_file == file
 
 
 def existing_ca(folder: Path, password: bytes) -> x509.Certificate:
@@ -161,7 +154,8 @@ def test_a_new_ca_may_be_kept_apart_and_half_a_ca_is_told(tmp_path: Path) -> Non
 
 def test_the_server_is_renewed_and_the_old_keys_are_kept(world: World) -> None:
     ca, first = load_ca(world.home.ca, PASSPHRASE, NOW), load_identity(world.home.server, PASSPHRASE)[0]
-    kept = [admin.renew_server(world.home, ca=ca, passphrase=PASSPHRASE, now=NOW) for _ in range(3)]
+    kept = [admin.renew_server(world.home, ca=ca, passphrase=PASSPHRASE, now=NOW + timedelta(seconds=second))
+            for second in range(3)]  # fmt: skip
     assert len(set(kept)) == 3
     assert load_identity(kept[0], PASSPHRASE)[0].public == first.public
     now, _ = load_identity(world.home.server, PASSPHRASE)
@@ -336,7 +330,7 @@ def test_another_reader_is_made_elsewhere_and_robots_registered_later_seal_for_i
     assert load_identity(analyst.path, b"analyst's")  # what was sealed for the old one only it can open
     world.revoke("analyst", Role.READER)
     assert not (world.home.readers / "analyst.pem").exists()
-    with pytest.raises(IdentityError, match="revoked already"):
+    with pytest.raises(IdentityError, match="is in force"):
         world.revoke("analyst", Role.READER)
 
 
@@ -354,7 +348,7 @@ def test_no_more_readers_than_a_chunk_has_room_for(world: World, tmp_path: Path)
 
 def test_a_robot_with_its_own_keys_is_registered_and_nothing_secret_is_in_its_bundle(world: World) -> None:
     made = world.register()
-    assert made.unfunded is None and made.buried == 0 and world.events == []
+    assert made.buried == 0 and world.events == []
     data = made.bundle.read_bytes()
     assert not needs_password(data) and b"PRIVATE" not in data
     robot = RobotHome(world.path / "robot-1")
@@ -502,9 +496,9 @@ def test_a_revocation_that_the_chain_did_not_hear_of_says_so_and_is_done_again(
         with pytest.raises(StoreError, match=r"half done: .* run `revoke robot_1` again"):
             world.revoke()
     assert world.revoke().block is not None
-    with pytest.raises(IdentityError, match="'robot_1' was revoked already"):
+    with pytest.raises(IdentityError, match="no robot 'robot_1' is in force"):
         world.revoke()
-    with pytest.raises(IdentityError, match="no robot 'robot_2' is enrolled"):
+    with pytest.raises(IdentityError, match="no robot 'robot_2' is in force"):
         world.revoke("robot_2")
 
 
@@ -515,7 +509,7 @@ def test_what_came_after_a_revocation_is_buried_by_revoking_again(world: World) 
     world.hand_over(3)
     assert world.revoke() == admin.Revoked(None, 3)
     assert len(world.store.dead()) == 3 and world.store.waiting(TK).chunks == 0
-    with pytest.raises(IdentityError, match="'robot_1' was revoked already"):
+    with pytest.raises(IdentityError, match="no robot 'robot_1' is in force"):
         world.revoke()
 
 
@@ -574,17 +568,6 @@ def test_a_crash_between_any_two_steps_is_mended_by_doing_it_again(
     assert world.written() == [] and len(world.store.dead()) == 2
 
 
-def test_a_treasury_that_is_empty_registers_and_says_that_there_is_no_eth_yet(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broke(*_: object) -> None:
-        raise admin.OutOfFunds("insufficient funds")
-
-    monkeypatch.setattr(world.ledger, "alloc_eth", broke)
-    made = world.register()
-    assert made.unfunded == "the operator's account has none for it" and made.bundle.exists()
-
-
 def test_a_robot_is_registered_also_where_its_account_gets_no_eth_at_once(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -594,24 +577,7 @@ def test_a_robot_is_registered_also_where_its_account_gets_no_eth_at_once(
 
     monkeypatch.setattr(world.ledger, "alloc_eth", down)
     made = world.register()
-    assert made.unfunded == "the node does not answer" and made.bundle.exists()
-
-
-def test_an_account_that_has_some_eth_is_given_up_to_what_the_contract_allows(world: World) -> None:
-    world.home.config.write_text(world.home.config.read_text() + "\n[funds]\nby = 5\n")
-    account = world.keys.account(3).address  # the server is 1, the owner 2
-    operator = world.keys.operator
-    fees = world.ledger.fees(world.ledger.block())
-    [(nonce, _)] = world.ledger.nonces([operator.address])
-    paid = operator.sign_transaction({
-        "chainId": world.ledger.chain_id, "nonce": nonce, "gas": 21_000, "value": 10**16, "to": account,
-        "maxFeePerGas": fees.highest, "maxPriorityFeePerGas": fees.tip or 0, "type": 2,
-    })  # fmt: skip
-    assert world.ledger.send([bytes(paid.raw_transaction)]) == [None]
-    assert world.ledger.balance(account) == 10**16
-    made = world.register()
-    assert made.account == account and made.unfunded is None
-    assert world.ledger.balance(account) == 5 * 10**18
+    assert made.bundle.exists()
 
 
 def test_a_revocation_of_a_reader_that_was_cut_short_is_done_again(
@@ -631,7 +597,7 @@ def test_a_revocation_of_a_reader_that_was_cut_short_is_done_again(
     with suppress(IdentityError):
         world.revoke("later", Role.READER)
     assert [path.name for path in world.home.readers.iterdir()] == ["owner.pem"]
-    with pytest.raises(IdentityError, match="'later' was revoked already"):
+    with pytest.raises(IdentityError, match="no reader 'later' is in force"):
         world.revoke("later", Role.READER)
 
 

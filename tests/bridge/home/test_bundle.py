@@ -12,7 +12,6 @@ import pytest
 
 from rosbridge_eth import identity as ids
 from rosbridge_eth.cli.robot import _say_who
-from rosbridge_eth.config import load_robot_config
 from rosbridge_eth.config.home import BridgeEnd, HomeKind, ReaderHome, RobotHome, kind_of, make_home
 from rosbridge_eth.errors import ConfigError, IdentityError
 from rosbridge_eth.identity import Role, load_identity
@@ -264,12 +263,11 @@ def test_a_robot_does_not_seal_for_a_reader_whose_certificates_have_ended(
     join(home, answer(ask_to_join(home, "robot_1", b"robot's")))
     (home.readers / "late.pem").write_bytes(EXPIRED.pem)
     home.raise_clock_floor(NOW.timestamp() + 10 * 86_400)
-    config = load_robot_config(home.config)
-    assert reader_keys(config, home, [CA.certificate]) == [READER.encryption_certificate.public_key]
+    assert reader_keys(home, [CA.certificate]) == [READER.encryption_certificate.public_key]
     assert "not sealed for reader late: its certificate ended at" in caplog.text
     (home.readers / "owner.pem").unlink()
     with pytest.raises(ConfigError, match="certificates of all readers have ended"):
-        reader_keys(config, home, [CA.certificate])
+        reader_keys(home, [CA.certificate])
 
 
 @pytest.mark.parametrize("part", ["certificates", "keys"])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rosbridge_eth.config.passphrases import read_passphrase
+from rosbridge_eth.config.passphrases import passphrase_file, read_passphrase
 from rosbridge_eth.errors import IdentityError
 
 
@@ -28,22 +28,21 @@ def test_the_credentials_folder_is_used_where_no_file_is_named(tmp_path: Path) -
 
 
 def test_which_file_holds_in_which_order(tmp_path: Path) -> None:
-    for name in ("given", "named", "rosbridge-eth-operator", "configured"):
+    for name in ("given", "named", "rosbridge-eth-operator"):
         (tmp_path / name).write_text(name)
     credentials = {"CREDENTIALS_DIRECTORY": str(tmp_path)}
     variable = {"ROSBRIDGE_ETH_OPERATOR_PASSPHRASE_FILE": str(tmp_path / "named")}
 
     def read(file: str | None, environment: dict[str, str]) -> bytes:
         return read_passphrase(
-            "operator", "Operator", file=None if file is None else tmp_path / file,
-            configured=tmp_path / "configured", environment=environment,
+            "operator", "Operator", file=None if file is None else tmp_path / file, environment=environment,
         )
 
     assert read("given", credentials | variable) == b"given"
     assert read(None, credentials | variable) == b"named"
     assert read(None, credentials) == b"rosbridge-eth-operator"
-    assert read(None, {}) == b"configured"
-    assert read(None, {"CREDENTIALS_DIRECTORY": "/nowhere"}) == b"configured"
+    assert passphrase_file("operator", {}) is None
+    assert passphrase_file("operator", {"CREDENTIALS_DIRECTORY": "/nowhere"}) is None
 
 
 @pytest.mark.parametrize("content", [b"", b"\n", None])

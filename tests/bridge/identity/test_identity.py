@@ -187,12 +187,10 @@ def test_a_ca_is_loaded_and_what_is_none_is_refused(tmp_path):
     (tmp_path / "ca.key.pem").chmod(0o644)
     with pytest.raises(IdentityError, match="chmod 600"):
         ids.load_ca(tmp_path, b"pass", TODAY)
-    put(OTHER_CA.key, CA.certificate)
-    with pytest.raises(IdentityError, match="not the key of"):
-        ids.load_ca(tmp_path, b"pass", TODAY)
-    put(ROBOT.signing_key, ROBOT.signing_certificate)
-    with pytest.raises(IdentityError, match="not a CA's"):
-        ids.load_ca(tmp_path, b"pass", TODAY)
+    for key, certificate in ((OTHER_CA.key, CA.certificate), (ROBOT.signing_key, ROBOT.signing_certificate)):
+        put(key, certificate)
+        with pytest.raises(IdentityError, match="cannot be certified"):
+            ids.enrol(ids.load_ca(tmp_path, b"pass", TODAY), ids.Role.ROBOT, "robot_3", at=TODAY)
     (tmp_path / "ca.crt.pem").unlink()
     with pytest.raises(IdentityError, match="cannot be read"):
         ids.load_ca(tmp_path, b"pass", TODAY)

@@ -88,7 +88,7 @@ def server(start) -> RedisServer:
     ],
     ids=["no AOF", "everysec", "no fsync while rewriting", "eviction"],
 )
-def test_a_redis_that_may_lose_chunks_is_refused_and_the_commands_named_mend_it(start, options, names):
+def test_a_redis_that_may_lose_chunks_is_refused_and_the_commands_named_fix_it(start, options, names):
     server = start(*options)
     store = open_url(server.url)
     with pytest.raises(StoreError, match="could lose") as refusal:
@@ -230,7 +230,7 @@ def test_without_the_package_one_sentence_says_how_to_get_it(tmp_path, monkeypat
                            max_bytes_per_robot=1)  # fmt: skip
 
 
-def test_no_redis_there_is_told_with_the_mend_and_the_password_is_not():
+def test_no_redis_there_is_told_with_the_fix_and_the_password_is_not():
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         url = f"redis://operator:hunter2@127.0.0.1:{unused.getsockname()[1]}/3"

@@ -159,7 +159,7 @@ def test_a_condition_that_does_not_fit_the_type_stops_the_start(robot: RobotHome
     (TOPICS.replace("trigger", "once = true, trigger") + CRASH, "one message only"),
     (TOPICS + CRASH + 'memory = "1 KiB"', "at least '64 KiB'"),
     (TOPICS + CRASH.replace('"5s"', '"0s"'), "longer than nothing"),
-    (TOPICS + CRASH.replace("before", "befor"), "did you mean 'before'"),
+    (TOPICS + CRASH.replace("before", "befor"), r"unknown key 'trigger\[0\].befor'"),
     (TOPICS + "".join(CRASH.replace("crash", f"c{number}") for number in range(17)), "16"),
 ])  # fmt: skip
 def test_a_mistake_is_told_with_its_place(tmp_path: Path, text: str, says: str):

@@ -73,12 +73,11 @@ def test_the_container_runs_a_command_that_exists_as_nobody_special_and_holds_no
 
 
 def test_the_page_describes_every_metric_there_is():
-    rows = [tuple(cell.strip() for cell in row.split("|")[1:5]) for row in PAGE.splitlines()
+    rows = [tuple(cell.strip() for cell in row.split("|")[1:4]) for row in PAGE.splitlines()
             if row.startswith("| `rosbridge_eth_")]  # fmt: skip
-    assert all(said for _, _, _, said in rows)
-    assert {name: (kind, labels) for name, kind, labels, _ in rows} == {
-        f"`rosbridge_eth_{name}`": ("gauge", ", ".join(f"`{label}`" for label in labels))
-        for name, labels in LABELS.items()
+    assert all(said for _, _, said in rows)
+    assert {name: labels for name, labels, _ in rows} == {
+        f"`rosbridge_eth_{name}`": ", ".join(f"`{label}`" for label in labels) for name, labels in LABELS.items()
     }
 
 

@@ -101,11 +101,11 @@ def test_more_readers_than_a_chunk_may_have_are_refused_before_it_is_sealed_for_
     home.config.write_text(ODOM + '[source]\nkind = "sim"\n')
     for number in range(MAX_READERS - 1):
         (home.readers / f"reader_{number}.pem").write_bytes(READER.public.pem)
-    config, roots = load_robot_config(home.config), [CA.certificate]
-    assert len(reader_keys(config, home, roots)) == MAX_READERS
+    roots = [CA.certificate]
+    assert len(reader_keys(home, roots)) == MAX_READERS
     (home.readers / "one_more.pem").write_bytes(READER.public.pem)
-    with pytest.raises(ConfigError, match="there are 17 readers, and a chunk is for 16 at most"):
-        reader_keys(config, home, roots)
+    with pytest.raises(ConfigError, match="certificates of 17 readers, and a chunk is for 1 to 16"):
+        reader_keys(home, roots)
 
 
 def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
