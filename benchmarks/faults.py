@@ -770,12 +770,12 @@ def revoked(site: Site, seed: int) -> Count:
 def twins(site: Site, seed: int) -> Count:
     """Two robots with one identity: one goes on, the other keeps what it says, and both and the server are told."""
     flow = Flow(site, "one identity twice", seed)
-    first = flow.start()
-    flow.pause(0.1, 0.3)
     double = site.folder / f"{flow.name}-double"
     flow.make_home(double)
     settings = double / "robot.toml"
     settings.write_text(settings.read_text().replace(f":{flow.monitor}", f":{free_port()}"))
+    first = flow.start()
+    flow.pause(0.1, 0.3)
     second = flow.start(double)
     flow.event("a second robot with the same keys")
     flow.finish(second, double)

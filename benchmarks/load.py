@@ -54,6 +54,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cache, partial
 from multiprocessing.connection import Connection
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -751,8 +752,8 @@ def title(f: Figures) -> str:
 def limit_of(runs: Sequence[Figures], use: Callable[[Figures], Use]) -> str:
     """What a load waited for: its own pace, the machine, a core of each shard, or none of them."""
     cores, shards = os.cpu_count() or 1, runs[0].shards
-    parts = [across(runs, lambda f, part=part: getattr(use(f), part)).median  # type: ignore[misc]
-             for part in ("shards", "submitters", "robots", "rest")]  # fmt: skip
+    uses = [use(figures) for figures in runs]
+    parts = [across(uses, attrgetter(part)).median for part in ("shards", "submitters", "robots", "rest")]
     shares = f"shards {parts[0]:.1f}, submitters {parts[1]:.1f}, robots {parts[2]:.1f}, node and rest {parts[3]:.1f}"
     if runs[0].pace:
         return f"the robots' pace; {sum(parts):.1f} of {cores} cores busy: {shares}"
