@@ -416,8 +416,8 @@ def revoke(
     """Take a name out of force: the server closes its session at once, the contract ends its right to write.
 
     The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
-    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters, and what a
-    worker with a slow disk took later when it is run again.
+    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters. Run it
+    again for chunks that were stored after it.
     ChainError, StoreError: half done; it is run again when node and store answer.
     """
     with Registry(home.registry) as registry:

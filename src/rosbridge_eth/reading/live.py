@@ -207,7 +207,7 @@ class _Handler(BaseHTTPRequestHandler):
         if re.sub(r":\d+$", "", self.headers.get("Host", "")).strip("[]").lower() not in self.names:
             self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")
         elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            # Another site's page cannot read them, but could take up all the room.
+            # Another site's page cannot read them, but could use all the connections.
             self._send(HTTPStatus.FORBIDDEN, b"these events are for this page only\n")
         elif self.path == "/events":
             self._send_events()
