@@ -20,14 +20,7 @@ const evidence = (() => {
     for (const byte of bytes) text += DIGITS[byte]
     return text
   }
-  const unhex = (text, size, what) => {
-    const isHex = typeof text === 'string' && text.length % 2 === 0 && !/[^0-9a-f]/.test(text)
-    need(isHex, `${what} is not lower-case hexadecimal`)
-    need(size === undefined || text.length === 2 * size, `${what} does not have ${size} bytes`)
-    const bytes = new Uint8Array(text.length / 2)
-    for (let n = 0; n < bytes.length; n++) bytes[n] = parseInt(text.substr(2 * n, 2), 16)
-    return bytes
-  }
+  const unhex = (text) => Uint8Array.from({ length: text.length / 2 }, (_, n) => parseInt(text.substr(2 * n, 2), 16))
   const join = (...parts) => {
     const bytes = new Uint8Array(parts.reduce((sum, part) => sum + part.length, 0))
     let at = 0
@@ -327,14 +320,30 @@ const evidence = (() => {
   const grouped = (fingerprint) => fingerprint.replace(/(.{4})(?=.)/g, '$1 ')
   const ascending = (list) => list.every((value, n) => n === 0 || list[n - 1] < value)
   const isCount = (value) => Number.isInteger(value) && value >= 0 && value < 2 ** 53
-  const list = (value, what) => {
-    need(Array.isArray(value), `${what} are no list`)
-    return value
+  const isHex = (size) => (value) => typeof value === 'string' && !/[^0-9a-f]/.test(value) &&
+    (size === undefined ? value.length % 2 === 0 : value.length === 2 * size)
+  const isList = (isOne, most, least = 0) => (value) =>
+    Array.isArray(value) && least <= value.length && value.length <= most && value.every(isOne)
+  const isObject = (members) => (value) => {
+    need(value !== null && typeof value === 'object' && Object.keys(value).join() === Object.keys(members).join(),
+      `it does not have the members ${Object.keys(members).join(', ')}`)
+    for (const [name, fits] of Object.entries(members)) need(fits(value[name]), `its member ${name} is not in its form`)
+    return true
   }
-  const members = (value, names, what) => {
-    need(value !== null && typeof value === 'object' && Object.keys(value).join() === names, `${what} is not in its form`)
-    return value
-  }
+  const isEvidence = isObject({
+    format: (value) => value === 'rosbridge-eth evidence 3',
+    robot: (value) => typeof value === 'string' && /^[a-z0-9][a-z0-9_.-]{0,62}$/.test(value),
+    tk: isHex(32), chain_id: isCount, genesis: isHex(32), contract: isHex(20),
+    authorities: isList(isHex(), 16, 1), certificates: isList(isHex(), 1000, 1),
+    chunks: isList(isObject({
+      chunk: isCount, certificate: isCount, encoded: isHex(), first: isCount, hashes: isList(isHex(32), 1e5), block: isCount,
+      transaction: isHex(32),
+    }), 1e5, 1),
+    records: isList(isObject({
+      chunk: isCount, record: (value) => isCount(value) && value < 1000,
+      line: (value) => typeof value === 'string' && !/\p{Cs}/u.test(value), salt: isHex(16), path: isList(isHex(32), 10),
+    }), 1e5, 1),
+  })
 
   function read(text) {
     let file
@@ -344,44 +353,25 @@ const evidence = (() => {
     } catch {
       throw new Wrong('this is no evidence: it is not JSON')
     }
-    members(file, 'format,robot,tk,chain_id,genesis,contract,authorities,certificates,chunks,records', 'the file')
-    need(file.format === 'rosbridge-eth evidence 3', 'this is evidence of another format')
+    isEvidence(file)
     const escaped = (char) => '\\u' + char.charCodeAt(0).toString(16).padStart(4, '0')
     need(JSON.stringify(file).replace(/[<\u007f-\uffff]/g, escaped) === text.trim(), 'the file is not in its one form')
-    need(typeof file.robot === 'string' && /^[a-z0-9][a-z0-9_.-]{0,62}$/.test(file.robot), 'no robot has such a name')
-    need(isCount(file.chain_id), 'the chain has no such id')
-    for (const chunk of list(file.chunks, 'the chunks')) {
-      members(chunk, 'chunk,certificate,encoded,first,hashes,block,transaction', 'a chunk')
-      const { chunk: at, certificate, first, block } = chunk
-      need([at, certificate, first, block].every(isCount), 'a chunk has no place')
-      need(list(chunk.hashes, 'the hashes of a batch').length <= 1e5, 'there is too much in the file')
-      unhex(chunk.transaction, 32, 'a transaction')
-    }
-    for (const record of list(file.records, 'the records')) {
-      members(record, 'chunk,record,line,salt,path', 'a record')
-      need(isCount(record.chunk) && isCount(record.record) && record.record < 1000, 'a record has no place')
-      need(typeof record.line === 'string' && !/\p{Cs}/u.test(record.line), 'a record has no line, or half a character in it')
-    }
-    need(file.records.length > 0 && file.chunks.length > 0, 'there is nothing in the file')
-    const most = file.records.length <= 1e5 && list(file.authorities, 'the CAs').length <= 16
-    need(most && list(file.certificates, 'the certificates').length <= 1000, 'there is too much in the file')
     return file
   }
 
   function verify(text, told) {
     const file = read(text)
     const { robot } = file
-    const [genesis, contract] = [unhex(file.genesis, 32, 'the first block'), unhex(file.contract, 20, 'the contract')]
-    const log = join(sm3(word(file.chain_id), genesis, contract), unhex(file.tk, 32, 'Tk'))
-    const authorities = file.authorities.map((one) => unhex(one, undefined, "a CA's certificate"))
+    const log = join(sm3(word(file.chain_id), unhex(file.genesis), unhex(file.contract)), unhex(file.tk))
+    const authorities = file.authorities.map(unhex)
     told('the file is whole and in its one form')
 
     const roots = authorities.map(certificate)
     const whole = ({ issuer, subject, key, tbs, r, s }) => issuer !== subject || signed(key, tbs, r, s)
-    need(roots.length && ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
+    need(ascending(file.authorities) && roots.every(whole), "a CA's certificate is not whole, or there twice")
     const signers = file.certificates.map((one) => {
       try {
-        return signer(unhex(one, undefined, 'a certificate'), roots, robot)
+        return signer(unhex(one), roots, robot)
       } catch (error) { // whatever the operator registered: of what is no certificate a part may be undefined
         throw new Wrong(`a certificate of the robot does not hold: ${error.message}`)
       }
@@ -390,10 +380,8 @@ const evidence = (() => {
 
     need(ascending(file.chunks.map(({ chunk }) => chunk)), 'the chunks are not in order')
     const chunks = new Map(file.chunks.map((written) => {
-      const encoded = unhex(written.encoded, undefined, 'a chunk')
-      for (const one of written.hashes) unhex(one, 32, 'a hash of a batch')
       need(written.hashes[written.chunk - written.first], `chunk ${written.chunk} is of no batch`)
-      const [chunk, by] = [chunkOf(encoded), signers[written.certificate]]
+      const [chunk, by] = [chunkOf(unhex(written.encoded)), signers[written.certificate]]
       need(by && isSigned(chunk, log, by.key), `the robot did not sign chunk ${written.chunk}`)
       need(chunk.bare || hex(sm3(chunk.body)) === chunk.bodyDigest, `the body of chunk ${written.chunk} is another`)
       need(chunk.sealed <= by.until, `chunk ${written.chunk} was sealed after the end of the robot's certificate`)
@@ -408,8 +396,7 @@ const evidence = (() => {
       try {
         const of = chunks.get(chunk)
         need(of, 'its chunk is not in the file')
-        const beside = list(path, 'the hashes of a path').map((one) => unhex(one, 32, 'a hash'))
-        const holds = proven(of.root, of.records, record, unhex(salt, 16, 'a salt'), utf8.encode(line), beside)
+        const holds = proven(of.root, of.records, record, unhex(salt), utf8.encode(line), path.map(unhex))
         need(holds, "it is not what the chunk's root commits to")
         const { kind, content } = lineOf(line)
         need(kind === 'message', 'it is no captured message')

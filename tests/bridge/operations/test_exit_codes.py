@@ -27,7 +27,8 @@ from smcrypto import sm2
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "operations.md"
 TABLE = PAGE.read_text(encoding="utf-8").partition("### Exit codes")[2].partition("###")[0]
-ROWS = re.findall(r"^\| `([a-z]+)` \| ([^|]+) \| (\d+) \|", TABLE, re.MULTILINE)
+FOUND = re.findall(r"^- `([a-z]+)` (\d+): (.+)$", TABLE, re.MULTILINE)
+ROWS = [(command, told, code) for command, code, told in FOUND]
 TK, STREAM = robot_id("robot_1"), b"s" * 16
 OPERATOR, READER = ("--passphrase-file", "pass"), ("--passphrase-file", "readers")
 REVOKE = ("revoke", "robot_1", "--compromised", *OPERATOR)
