@@ -78,6 +78,15 @@ def test_what_others_may_read_is_told(place: Place, capsys: Capture) -> None:
         assert (f"{file} may be read by other users" in capsys.readouterr().err) is told
 
 
+def test_a_command_that_is_told_can_be_pasted(place: Place, capsys: Capture) -> None:
+    """A home whose name has a space."""
+    joined = ["join", "--name", "robot_5", "--home", "a b", "--source", "sim", "--yes", "--password-file", "word"]
+    assert run(joined) == 0
+    assert "rosbridge-eth register robot_5 'a b/request.json'" in capsys.readouterr().err
+    assert run(["robot", "--home", "a b", "--password-file", "word"]) == ExitCode.CONFIG
+    assert "run `robot --home 'a b'`" in capsys.readouterr().err
+
+
 def test_help_is_grouped_by_who_gives_a_command(capsys: Capture) -> None:
     assert run(["--help"]) == 0
     shown = capsys.readouterr().out

@@ -250,7 +250,7 @@ def test_a_source_that_loses_messages_while_the_spool_takes_nothing_fills_no_mem
 ) -> None:
     robot = make(1000)
     Full(robot, monkeypatch)
-    for name, value in {"LOSSES_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3}.items():
+    for name, value in {"LOOK_EVERY": 0.0, "LONGEST_WAIT": 0.01, "MAX_UNSPOOLED": 3}.items():
         monkeypatch.setattr(f"rosbridge_eth.robot.loop.{name}", value)
     waiting: list[int] = []
 

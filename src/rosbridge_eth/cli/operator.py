@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -139,7 +140,7 @@ def up(
             if anvil is not None:
                 anvil.keeps(made.contract)  # a kill costs some seconds of the chain; without its contract, all of it
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
-        where = "" if home == OPERATOR_HOME else f" --home {home}"
+        where = "" if home == OPERATOR_HOME else f" --home {shlex.quote(str(home))}"
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
@@ -249,7 +250,7 @@ def register(
     try:
         answer = RobotHome(request.parent).answer  # where the request lies in the robot's home
         write_atomically(answer, made.bundle.read_bytes())  # which `robot` may look for at this moment
-        where = "" if request.parent == terminal.ROBOT_HOME else f" --home {request.parent}"
+        where = "" if request.parent == terminal.ROBOT_HOME else f" --home {shlex.quote(str(request.parent))}"
         talk(f"Run there now: rosbridge-eth robot{where}")
     except (OSError, ConfigError):
         talk(f"Carry {made.bundle} into the robot's home and run there: rosbridge-eth robot")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
@@ -68,7 +69,7 @@ def join(
     password = read_passphrase("robot", f"Password for the keys of {name}", file=password_file, confirm=True)
     bundles.ask_to_join(place, name, password, config)
     talk(f"{home} has the keys of {name}; they never leave it. {place.config} says what it sends.")
-    talk(f"The operator runs now: rosbridge-eth register {name} {place.request}")
+    talk(f"The operator runs now: rosbridge-eth register {name} {shlex.quote(str(place.request))}")
 
 
 def _first_config(place: RobotHome, source: str | None, topics: list[str], *, asks: bool, yes: bool) -> str:
@@ -212,7 +213,7 @@ def trigger(
 ) -> None:
     """Trigger an event now. The robot that runs with this home writes what it has in memory."""
     (place := RobotHome(home)).bridge()
-    nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
+    nobody = ConfigError(f"no robot runs with the home {home}, or it has no trigger: nothing is kept in memory")
     if (figures := metrics.running(home).get("robot")) is None:
         raise nobody
     known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]

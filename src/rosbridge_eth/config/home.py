@@ -40,6 +40,7 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -280,7 +281,7 @@ class RobotHome:
         self._head()
         absent = ConfigError(
             f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
-            f" a bundle; put that into {self.path} and run `robot --home {self.path}`"
+            f" a bundle; put that into {self.path} and run `robot --home {shlex.quote(str(self.path))}`"
         )
         return _load(BridgeEnd, self.bridge_file, "join again", absent)
 

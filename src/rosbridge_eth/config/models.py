@@ -236,7 +236,6 @@ class SimConfig(Section):
 
     robot: NAME.
 
-    seed: The same seed drives the same way.
 
     rate: Messages per second.
 
@@ -247,7 +246,6 @@ class SimConfig(Section):
 
     kind: Literal["sim"]
     robot: TopicPart = "robot_1"
-    seed: int = Field(default=1, ge=0, lt=2**63)
     rate: float = Field(default=10.0, ge=1e-6, le=10_000)
     duration: DurationNs | None = None
     speed: Speed = 1.0

@@ -48,9 +48,8 @@ LIVE_BYTES = 128 << 20  # and where it cannot: twice the largest message that is
 TAKE = 128  # raw messages captured before the network gets its turn again
 GATHER = 0.05  # seconds that messages gather in the queue: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
-LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
+LOOK_EVERY = 1.0  # seconds between looks at what was lost, and at whether the kernel's clock is synchronised
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
-SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
 LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
@@ -81,8 +80,8 @@ class Robot:
         self._stop, self._source_ended = threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
-        self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
-        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = self._take_at = float("-inf")
+        self._failing: dict[str, tuple[str, float]] = {}  # what the spool does not do now: why, and when it is retried
+        self._look_at = self._take_at = float("-inf")
         self._synchronised = self._finished = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
@@ -140,7 +139,7 @@ class Robot:
                 self.loop.seek(now)
                 self._send(now)
                 on_turn()
-                if self._finished and not self._unspooled and self._spool_or(False, "idle", lambda: self.sender.idle):
+                if self._finished and not self._unspooled and self._idle(False, now):
                     break
                 self.loop.step(self._wait(now))
             else:
@@ -150,7 +149,7 @@ class Robot:
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 if not self._finished:
                     self._finish(time.monotonic())
-                self._spool_at = float("-inf")  # the last chunks do not wait
+                self._failing.clear()  # the last chunks do not wait
                 self._spool_chunks([], time.monotonic())
                 self._last_words()
         finally:
@@ -162,7 +161,7 @@ class Robot:
             finally:
                 self.source.close()
                 reading.join(timeout=5)
-                self.summary = self._spool_or("the spool cannot be read", "sum", self._summarise)
+                self.summary = self._spool_or("the spool cannot be read", "sum", time.monotonic(), self._summarise)
                 self.spool.close()
                 self.loop.close()
         if self._source_error is not None:
@@ -189,8 +188,10 @@ class Robot:
     # The loop's thread
 
     def _take(self, now: float) -> None:
-        if now - self._synchronised_at > SYNCHRONISED_EVERY:
-            self._synchronised, self._synchronised_at = clock_synchronised(), now
+        if now >= self._look_at:
+            self._look_at, self._synchronised = now + LOOK_EVERY, clock_synchronised()
+            if len(self._unspooled) < MAX_UNSPOOLED:
+                self._add_losses(now)
         for _ in range(TAKE):
             if len(self._unspooled) >= MAX_UNSPOOLED or self.writer.next_timer() <= now:
                 break
@@ -201,9 +202,6 @@ class Robot:
                 self._capture(raw, now)
             else:
                 break
-        if now - self._losses_at >= LOSSES_EVERY and len(self._unspooled) < MAX_UNSPOOLED:
-            self._losses_at = now
-            self._add_losses(now)
 
     def _capture(self, raw: RawMessage, now: float) -> None:
         self.box.look(raw)
@@ -231,9 +229,7 @@ class Robot:
         """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the queue."""
         self._unspooled.extend(chunks)
         self.chunks += len(chunks)
-        if "append" not in self._failing or now - self._spool_at >= SPOOL_AGAIN:
-            self._spool_at = now
-            self._spool_or(None, "append", self._append)
+        self._spool_or(None, "append", now, self._append)
 
     def _append(self) -> None:
         while self._unspooled:
@@ -241,10 +237,7 @@ class Robot:
             self._unspooled.popleft()
 
     def _send(self, now: float) -> None:
-        """What the spool cannot do is tried again, a second later."""
-        if now >= self._send_at:
-            self._spool_or(None, "send", partial(self.sender.send, now))
-            self._send_at = now + SPOOL_AGAIN if "send" in self._failing else now
+        self._spool_or(None, "send", now, lambda: self.sender.send(now))
 
     def _wait(self, now: float) -> float:
         due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
@@ -258,9 +251,7 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
-            if (now := time.monotonic()) >= deadline:
-                break
+        while self.sender.connected and not self._idle(True, now := time.monotonic()) and now < deadline:
             self._spool_chunks([], now)
             self._send(now)
             self.loop.step(0.02)
@@ -269,18 +260,23 @@ class Robot:
         """Take one event of the client."""
         self.sender.handle(event, time.monotonic())
 
-    def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
-        """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
+    def _idle(self, otherwise: bool, now: float) -> bool:
+        return self._spool_or(otherwise, "idle", now, lambda: self.sender.idle)
+
+    def _spool_or(self, otherwise: _T, what: str, now: float, call: Callable[[], _T]) -> _T:
+        """What `call` gives, or `otherwise` where the spool does not do that; then it is retried SPOOL_AGAIN later.
 
         A spool may do one thing and not another: it works again when all that it did not do is done.
         """
+        if now < self._failing.get(what, ("", now))[1]:
+            return otherwise
         try:
             given = call()
         except StoreError as error:
-            self._failing[what], given = str(error), otherwise
+            self._failing[what], given = (str(error), now + SPOOL_AGAIN), otherwise
         else:
             self._failing.pop(what, None)
-        self.spool_trouble.now(next(iter(self._failing.values()), None))
+        self.spool_trouble.now(next((why for why, _ in self._failing.values()), None))
         return given
 
     def _summarise(self) -> str:

@@ -137,15 +137,15 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
 
     monkeypatch.setattr(socket, "getaddrinfo", away)
     robot = opened(place, f'server = "robots.example:7410"\n{ODOM}{BAG}')
-    captured = len(list(robot.source.messages()))  # type: ignore[attr-defined]
+    captured, figures = len(list(robot.source.messages())), list[object]()  # type: ignore[attr-defined]
 
     def on_turn() -> None:
-        metrics.show(metrics.of_robot("robot_1", robot, 0.0))
+        figures[:] = metrics.of_robot("robot_1", robot, 0.0)
         if robot.captured == captured and robot.sender.refusal:
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert metrics.FIGURES["condition", (("process", "robot"), ("name", "server's name has an address"))] == 0
+    assert ("condition", {"process": "robot", "name": "server's name has an address"}, False) in figures
     [said] = warnings(caplog)
     why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
     assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary
