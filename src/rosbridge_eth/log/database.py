@@ -4,7 +4,7 @@ WAL mode, one fsync a commit: what was committed survives the loss of power. A p
 to the file needs room on the disk a second time, when it is copied there, and as long as it cannot be copied
 nothing at all can be written, not even what removes. So a file FILE.reserve keeps that room: the log is copied
 every `wal_pages`, and a write that finds the disk full removes the reserve, has the log copied, and is tried again.
-As long as the reserve cannot be made anew, the file may not grow: rows can be removed, and others take their place.
+As long as the reserve cannot be made again, the file may not grow: rows can be removed, and others take their place.
 """
 
 from __future__ import annotations
