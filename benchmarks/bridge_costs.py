@@ -216,7 +216,7 @@ def gas(chunks: list[Chunk]) -> float:
     keys = Keyring.create()
     chain = EmbeddedChain(fund={keys.operator.address: 10**21})
     ledger, _ = Ledger.deploy(chain, keys.operator)
-    robot, total = keys.robot(1), 0
+    robot, total = keys.account(1), 0
     ledger.registration(keys.operator, PLACE.tk, robot.address, b"certificates")
     ledger.alloc_eth(keys.operator, robot.address, 10**18)
     batch: list[bytes] = []

@@ -94,6 +94,16 @@ def test_help_is_grouped_by_who_gives_a_command(capsys: Capture) -> None:
         "All:", "Operator:", "Robot:", "Reader:"]
 
 
+def test_no_private_words_are_left() -> None:
+    """Words that a newcomer did not understand at the first reading."""
+    words = re.compile(
+        "names the mend|robots' door|nobody's home|of your own with|log branches|kept for later|knows nothing|take up|"
+        r"give what a robot wrote|slow disk took|\banew\b|be had\b|in good order", re.IGNORECASE)
+    found = [f"{file.name}: {line}" for file in Path(terminal.__file__).parent.rglob("*.py")
+             for line in file.read_text().splitlines() if words.search(line)]  # fmt: skip
+    assert not found
+
+
 def test_a_date_is_a_whole_day() -> None:
     choice = _choice_of(None, "2026-11-21", "2026-11-22", None)
     assert (choice.from_ns, choice.to_ns) == (1_795_219_200_000_000_000, 1_795_219_200_000_000_000 + 2 * DAY_NS)

@@ -1,7 +1,7 @@
 """The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
 Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none: its
-`.unfinished` is left, and who makes a home there begins anew. While a shard of the server or a robot runs,
+`.unfinished` is left, and who makes a home there starts again. While a shard of the server or a robot runs,
 `.shard-0.json` or `.robot.json` is what it counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:

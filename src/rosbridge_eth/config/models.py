@@ -467,7 +467,7 @@ class ServerConfig(Section):
         first, *others = self.public or [self.listen]
         if lost := [address for address in (first, *others) if address.nowhere]:
             raise ConfigError(
-                f"robots would be told to send to {lost[0]}, which is no machine's address: write into server.toml"
+                f"robots would be told to send to {lost[0]}, which no machine can have: write into server.toml"
                 ' public = "HOST:PORT", as robots reach the server'
             )
         return [first, *others] if others else [first.next(shard) for shard in range(self.shards)]

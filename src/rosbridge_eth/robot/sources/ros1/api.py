@@ -46,7 +46,7 @@ class ProtocolError(SourceError):
 
 
 class Refusal(SourceError):
-    """The peer answered in good order that it will not do what was asked, or cannot be recorded as it is."""
+    """The peer answered correctly that it will not do what was asked, or cannot be recorded as it is."""
 
 
 FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError, OverflowError)

@@ -207,7 +207,7 @@ class Ros1Source(LiveSource):
         if publisher.over.is_set():
             return
         publisher.over.set()
-        publisher.topic.nodes = None  # it may have started anew somewhere else
+        publisher.topic.nodes = None  # it may have started again somewhere else
         text = f"{publisher.name}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
         if publisher.connected and not isinstance(error, SourceError):
             log.info("%s", text)

@@ -146,7 +146,7 @@ class Ros2Source(LiveSource):
             if topic.refused:
                 self._node.destroy_subscription(topic.subscription)
                 topic.subscription, topic.refused = self._subscribe(topic), False
-                log.info("%s: publishers changed, watched anew", topic.offer.topic)
+                log.info("%s: publishers changed, watched again", topic.offer.topic)
 
     def _read_graph(self, only_wanted: bool = False) -> list[Offer]:
         """What is offered. only_wanted: leave out what no name or pattern of a topic means."""
