@@ -251,9 +251,11 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.connected and not self._idle(True, now := time.monotonic()) and now < deadline:
+        while self.sender.connected and (now := time.monotonic()) < deadline:
             self._spool_chunks([], now)
-            self._send(now)
+            self._send(now)  # which notes the newest state, too, so that the summary says what the server has
+            if self._idle(True, now):
+                break
             self.loop.step(0.02)
 
     def handle(self, event: Event) -> None:

@@ -120,6 +120,13 @@ def test_a_revoked_robot_ends_with_the_reason_for_what_it_keeps(
     assert re.search(r"[1-9]\d* chunks not yet at the server", robot.summary)
 
 
+def test_a_robot_that_is_stopped_says_that_the_server_has_its_last_chunk(place: Place, server: Address) -> None:
+    """At an ordinary Ctrl-C: what the server said last counts."""
+    robot = opened(place, place.robot.config.read_text() + "rate = 100\n")
+    robot.run(on_turn=lambda: robot.stop() if robot.sender.connected and robot.captured > 30 else None)
+    assert robot.summary.endswith("nothing waits for the server.")
+
+
 def test_a_mode_that_the_server_may_not_take_is_named(
     place: Place, server: Address, impatient: None, caplog: Logged
 ) -> None:
