@@ -97,13 +97,15 @@ class Odometry:
         self.messages = list(bag.messages())
         bag.close()
         self.count, self.pace = count, pace
+        self.seconds = 0.0
+        """Of the processor, in the thread that `run` had: with a pace it is woken once a message."""
 
     def __iter__(self) -> Iterator[RawMessage]:
         for number in range(self.count):
             yield self.messages[number % len(self.messages)]
 
     def run(self, emit: Any, stop: threading.Event) -> None:
-        due = time.monotonic()
+        due, used = time.monotonic(), time.thread_time()
         for message in self:
             if stop.is_set():
                 return
@@ -111,6 +113,7 @@ class Odometry:
             if self.pace:
                 due += 1 / self.pace
                 time.sleep(max(0.0, due - time.monotonic()))
+        self.seconds = time.thread_time() - used
 
     def close(self) -> None:
         """Nothing is open."""
@@ -213,7 +216,7 @@ def gas(chunks: list[Chunk]) -> float:
     keys = Keyring.create()
     chain = EmbeddedChain(fund={keys.operator.address: 10**21})
     ledger, _ = Ledger.deploy(chain, keys.operator)
-    robot, total = keys.robot(1), 0
+    robot, total = keys.account(1), 0
     ledger.registration(keys.operator, PLACE.tk, robot.address, b"certificates")
     ledger.alloc_eth(keys.operator, robot.address, 10**18)
     batch: list[bytes] = []
@@ -228,11 +231,12 @@ def gas(chunks: list[Chunk]) -> float:
 
 def throughput(
     who: Identities, folder: Path, records: int, whole: bool, *, pace: float = 0.0
-) -> tuple[float, float, int, float]:
+) -> tuple[float, float, int, tuple[float, float]]:
     """From the source to the server's commit, two processes on loopback.
 
     Records a second, records in a chunk, lines in the store (the records, and those that open the stream), and
-    milliseconds a record of the robot's processor, session and all. pace: messages a second, 0: as fast as it goes.
+    milliseconds a record of the robot's processor, session and all: in the thread of the source, and elsewhere.
+    pace: messages a second, 0: as fast as it goes.
     """
     sock = server_socket(("127.0.0.1", 0))
     port = sock.getsockname()[1]
@@ -249,8 +253,9 @@ def throughput(
     client = Client(ClientConfig(), who.robot, who.trust, "server", now)
     writer = who.writer(1.0 if pace else 0.05, now)
     sender = Sender(client, spool, writer)
+    source = Odometry(records, pace)
     robot = Robot(
-        source=Odometry(records, pace), capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
+        source=source, capture=Capture([rule(whole)], source_kind="bag"),  # type: ignore[arg-type]
         writer=writer, spool=spool, client=client, sender=sender,
         servers=[Address("127.0.0.1", port)],
     )  # fmt: skip
@@ -264,7 +269,8 @@ def throughput(
     store = SqliteStore(folder / "store-2.sqlite", LEDGER, GIB, GIB)
     stored = store.waiting(PLACE.tk).records
     store.close()
-    return records / seconds, records / robot.chunks, stored, used / records * 1000
+    waking, rest = (each / records * 1000 for each in (source.seconds, used - source.seconds))
+    return records / seconds, records / robot.chunks, stored, (waking, rest)
 
 
 def first_edition(folder: Path, records: int) -> dict[str, Any]:
@@ -319,9 +325,9 @@ def main() -> None:
         print(f"\nThrough loopback, robot and server as two processes, {rates[-1]['fields']}: {rate:,.0f} records/s, "
               f"{per_chunk_:.0f} records a chunk")
     with tempfile.TemporaryDirectory() as folder:
-        _, per_chunk_, _, paced = throughput(who, Path(folder), int(20 * PACE), False, pace=PACE)
+        _, per_chunk_, _, (waking, paced) = throughput(who, Path(folder), int(20 * PACE), False, pace=PACE)
     print(f"\nAt {PACE:.0f} messages a second, {per_chunk_:.0f} records a chunk: robot {paced:.3f} ms a record, session"
-          " and all")
+          f" and all, and {waking:.3f} ms to be woken for each message")
     if options.first_edition is not None:
         after = first_edition(options.first_edition, 3000)
         for name, figures in (("before", before), ("after", after)):
@@ -330,7 +336,8 @@ def main() -> None:
             print(f"\nFirst edition, {name}: robot {robot:.3f} ms, server {server:.3f} ms a record, "
                   f"{figures['messages_per_second']:,.0f} records/s")
     if options.json:
-        options.json.write_text(json.dumps({"rows": rows, "throughput": rates, "paced": paced}, indent=1))
+        figures = {"rows": rows, "throughput": rates, "paced": paced, "waking": waking}
+        options.json.write_text(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def network(kind: str, clients: int, period: int, dag: Path | None = None) -> It
             with Anvil.start(free_port(), block_time=period) as node:
                 node.fund(KEYS.operator.address, 100)
                 for client in range(1, clients + 1):  # some of them are those that anvil makes rich
-                    node.ask("anvil_setBalance", KEYS.robot(client).address, "0x0")
+                    node.ask("anvil_setBalance", KEYS.account(client).address, "0x0")
                 yield [node.url]
             return
         balances = geth_network.ten_accounts(KEYS.operator.address)
@@ -120,7 +120,7 @@ def write_and_ask(url: str, address: str, clients: dict[int, int]) -> Times:
         for client, start in clients.items():
             tail = keccak(record(client, number - 1)) if number else NOTHING
             data = ledger.calldata("setData", robot_id(f"client_{client}"), number, tail, [record(client, number)])
-            requests.send(KEYS.robot(client), start + number, data, set_data_gas([256]))
+            requests.send(KEYS.account(client), start + number, data, set_data_gas([256]))
         requests.settle()
     for number in range(QUERIES):
         for client in clients:
@@ -139,11 +139,11 @@ def measure(urls: list[str], clients: int) -> dict[str, Times]:
     times: Times = defaultdict(list)
     requests, nonce = Requests(ledger, times), ledger.nonces([KEYS.operator.address])[0][0]
     starts = {client: start for client, (start, _) in enumerate(
-        ledger.nonces([KEYS.robot(client).address for client in range(1, clients + 1)]), 1)}  # fmt: skip
+        ledger.nonces([KEYS.account(client).address for client in range(1, clients + 1)]), 1)}  # fmt: skip
     # Each registration first: money goes to registered accounts alone, and not above 5 ETH.
     for function, value in (("registration", 0), ("allocETH", ETH // 10)):
         for client in range(1, clients + 1):
-            address = KEYS.robot(client).address
+            address = KEYS.account(client).address
             data = (ledger.calldata(function, robot_id(f"client_{client}"), address, b"certificates")
                     if function == "registration" else ledger.calldata(function, address))
             requests.send(KEYS.operator, nonce, data, call_gas(data), value)

@@ -203,7 +203,7 @@ class Robot:
     """Seals chunks; sends what follows the store's head; keeps on its disk what it was not told to be confirmed."""
 
     def __init__(self, number: int, ledger: bytes, dice: random.Random) -> None:
-        self.account, self.tk = KEYS.robot(number), robot_id(f"robot_{number}")
+        self.account, self.tk = KEYS.account(number), robot_id(f"robot_{number}")
         self._log, self._dice = Log(ledger, self.tk), dice
         self.written: list[Chunk] = []
         self.disk: list[Chunk] = []
@@ -238,7 +238,7 @@ def submit(url: str, contract: str, path: str, ledger: str) -> None:
     """The child: a submitter, until it is killed."""
     submitter.PATIENCE = PATIENCE  # the runs are short
     submitter.LONGEST_PAUSE = 2.0
-    keys = {robot_id(f"robot_{n}"): KEYS.robot(n) for n in range(1, ROBOTS + 1)}
+    keys = {robot_id(f"robot_{n}"): KEYS.account(n) for n in range(1, ROBOTS + 1)}
     store = SqliteStore(Path(path), bytes.fromhex(ledger), 10**9, 10**8)
     writer = submitter.Submitter(
         Ledger(url, contract, timeout=5), store, keys.keys, keys.get, KEYS.operator,

@@ -36,7 +36,7 @@ class Measurement:
 
     def __init__(self, rules: type) -> None:
         keyring = Keyring.from_mnemonic("test " * 11 + "junk")
-        self.operator, self.robot, self.other = keyring.operator, keyring.robot(1), keyring.robot(2)
+        self.operator, self.robot, self.other = keyring.operator, keyring.account(1), keyring.account(2)
         self.random = random.Random(1)  # noqa: S311 - chunks for measuring, the same each time
         wealth = {account.address: 1000 * ETH for account in (self.operator, self.robot)}
         self.ledger, receipt = Ledger.deploy(EmbeddedChain(wealth, rules=rules), self.operator)

@@ -62,7 +62,7 @@ def read_file(path: Path, *, private: bool = False) -> bytes:
     if private and mode & 0o077:
         raise IdentityError(
             f"{path} is open to others (mode {mode:04o}); run `chmod 600 {path}`, and if it may have been read,"
-            " make its keys anew"
+            " make new keys"
         )
     return content
 

@@ -182,7 +182,7 @@ def _check_usage(peer: PeerIdentity) -> None:
         if certificate.extended_key_usage is not None or not {*usages} <= {*allowed} or {*others} & {*allowed}:
             raise UntrustedCertificate(
                 f"the certificates of {peer} are for another use than signing and encrypting logs. Those of earlier"
-                " versions are made anew: of a robot by `register --replace` and `join`, of the server by `renew`, of"
+                " versions are made again: of a robot by `register --replace` and `join`, of the server by `renew`, of"
                 " a reader by `reader` in a new folder"
             )
 

@@ -78,11 +78,30 @@ def test_what_others_may_read_is_told(place: Place, capsys: Capture) -> None:
         assert (f"{file} may be read by other users" in capsys.readouterr().err) is told
 
 
+def test_a_command_that_is_told_can_be_pasted(place: Place, capsys: Capture) -> None:
+    """A home whose name has a space."""
+    joined = ["join", "--name", "robot_5", "--home", "a b", "--source", "sim", "--yes", "--password-file", "word"]
+    assert run(joined) == 0
+    assert "rosbridge-eth register robot_5 'a b/request.json'" in capsys.readouterr().err
+    assert run(["robot", "--home", "a b", "--password-file", "word"]) == ExitCode.CONFIG
+    assert "run `robot --home 'a b'`" in capsys.readouterr().err
+
+
 def test_help_is_grouped_by_who_gives_a_command(capsys: Capture) -> None:
     assert run(["--help"]) == 0
     shown = capsys.readouterr().out
     assert [line for line in shown.splitlines() if re.fullmatch(r"[A-Z][a-z]+:", line)][-4:] == [
         "All:", "Operator:", "Robot:", "Reader:"]
+
+
+def test_no_private_words_are_left() -> None:
+    """Words that a newcomer did not understand at the first reading."""
+    words = re.compile(
+        "names the mend|robots' door|nobody's home|of your own with|log branches|kept for later|knows nothing|take up|"
+        r"give what a robot wrote|slow disk took|\banew\b|be had\b|in good order", re.IGNORECASE)
+    found = [f"{file.name}: {line}" for file in Path(terminal.__file__).parent.rglob("*.py")
+             for line in file.read_text().splitlines() if words.search(line)]  # fmt: skip
+    assert not found
 
 
 def test_a_date_is_a_whole_day() -> None:

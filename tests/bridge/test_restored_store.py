@@ -28,7 +28,7 @@ from rosbridge_eth.log.store import Store
 from rosbridge_eth.server.submitter import Settings, Submitter
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")
-ACCOUNT = KEYS.robot(1)
+ACCOUNT = KEYS.account(1)
 CERTIFICATES = identity(Role.ROBOT).public.certificates
 SEEDS = range(int(os.environ.get("RESTORE_SEEDS", "4")))
 CONFIRMATIONS = 3

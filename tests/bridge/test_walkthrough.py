@@ -78,7 +78,7 @@ def test_four_commands_are_all_it_takes_to_a_proven_record(tmp_path: Path, requi
                 words = process.read_bytes().split(b"\0")
                 if b"--state" in words and port.encode() in words:
                     os.kill(int(process.parent.name), signal.SIGKILL)
-        up.until("the local chain ended by itself")
+        up.until("the local chain stopped by itself")
         assert up.end() == ExitCode.CHAIN
     assert "Traceback" not in up.shown + robot.shown
 

@@ -41,18 +41,17 @@ BYTES: Final = frozenset({"uint8", "char", "byte"})
 
 
 class Conversion:
-    """One type's compiled conversion. `convert(message)` gives the record's data.
-
-    digested: the latest field that a digest stood for.
-    """
+    """One type's compiled conversion. `convert(message)` gives the record's data."""
 
     def __init__(self, decoder: Decoder, selection: Selection = None, *, limit: int = DEFAULT_LIMIT) -> None:
         self._fields = decoder.fields
         self._ros1 = decoder.wire is Wire.ROS1
         self._limit = limit
         self.type_name = decoder.type_name
-        self.digested = ""
-        self._names: dict[str, Any] = {"isfinite": isfinite, "_float": _float}  # of functions, in the expression
+        self._names: dict[str, Any] = {  # of functions, in the expression
+            "isfinite": isfinite, "_float": _float, "_string": lambda value: self._bounded(value, value.encode()),
+            "_list": lambda items: self._bounded(items, orjson.dumps(items) if items else b""),
+        }  # fmt: skip
         expression = self._message(self.type_name, selection, "m", "")
         self.convert: Callable[[Any], dict[str, Any]] = eval(f"lambda m: {expression}", self._names)  # noqa: S307
 
@@ -77,7 +76,7 @@ class Conversion:
     def _value(self, description: FieldDesc, selection: Selection, value: str, path: str) -> str:
         if description[0] == Nodetype.BASE:
             self._check_leaf(selection, path, f"a {description[1][0]}")
-            return self._scalar(description[1][0], value, path)
+            return self._scalar(description[1][0], value)
         if description[0] == Nodetype.NAME:
             if description[1] in (TIME, DURATION):
                 self._check_leaf(selection, path, "captured as one number, in nanoseconds")
@@ -99,11 +98,11 @@ class Conversion:
         if selection is not None:
             raise ConfigError(f"field {path!r} of {self.type_name} is {what}: nothing can be selected in it")
 
-    def _scalar(self, base: str, value: str, path: str) -> str:
+    def _scalar(self, base: str, value: str) -> str:
         if base in ("float32", "float64"):
             return f"v if isfinite(v := {value}) else _float(v)"
         if base == "string":  # a character is at most 4 bytes of UTF-8
-            return f"v if len(v := {value}) <= {self._limit // 4} else {self._call(self._string(path))}(v)"
+            return f"v if len(v := {value}) <= {self._limit // 4} else _string(v)"
         if base == "byte" and not self._ros1:
             return f"{value} & 0xFF"  # rosbags reads it as signed
         return value
@@ -119,10 +118,10 @@ class Conversion:
 
     def _array(self, element: FieldDesc, selection: Selection, value: str, path: str) -> str:
         if element[0] == Nodetype.BASE and element[1][0] != "string":
-            return f"{self._call(self._numbers(element[1][0], path))}({value})"
+            return f"{self._call(self._numbers(element[1][0]))}({value})"
         item = self._call(None)  # a name that no array within this one has
         inner = self._value(element, selection, item, f"{path}[*]")
-        return f"{self._call(self._list(path))}([{inner} for {item} in {value}])"
+        return f"_list([{inner} for {item} in {value}])"
 
     def _elements(self, element: FieldDesc, elements: dict[int, Selection], value: str, path: str) -> str:
         """The chosen ones by index, as far as the array has them."""
@@ -144,20 +143,17 @@ class Conversion:
         self._names[name] = function
         return name
 
-    def _string(self, path: str) -> Callable[[str], Any]:
-        def convert(value: str) -> Any:
-            encoded = value.encode()
-            return value if len(encoded) <= self._limit else self._too_large(path, encoded)
+    def _bounded(self, value: Any, content: bytes) -> Any:
+        """The value, or the digest of its content where that is above the limit."""
+        return value if len(content) <= self._limit else _digest(content)
 
-        return convert
-
-    def _numbers(self, base: str, path: str) -> Callable[[Any], Any]:
+    def _numbers(self, base: str) -> Callable[[Any], Any]:
         wire = NUMBERS[base]
         longest, binary, real = self._limit // wire.itemsize, base in BYTES, base in ("float32", "float64")
 
         def convert(value: Any) -> Any:
             if len(value) > longest:
-                return self._too_large(path, numpy.asarray(value, wire).tobytes())
+                return _digest(numpy.asarray(value, wire).tobytes())
             array = numpy.asarray(value)
             if binary:
                 return b64encode(array.tobytes() if array.itemsize == 1 else bytes(value)).decode("ascii")
@@ -167,16 +163,9 @@ class Conversion:
 
         return convert
 
-    def _list(self, path: str) -> Callable[[list[Any]], Any]:
-        def convert(items: list[Any]) -> Any:
-            encoded = orjson.dumps(items) if items else b""
-            return items if len(encoded) <= self._limit else self._too_large(path, encoded)
 
-        return convert
-
-    def _too_large(self, path: str, content: bytes) -> dict[str, Any]:
-        self.digested = path
-        return {"sm3": sm3.digest(content).hex(), "length": len(content)}
+def _digest(content: bytes) -> dict[str, Any]:
+    return {"sm3": sm3.digest(content).hex(), "length": len(content)}
 
 
 def _float(value: float) -> float | str:

@@ -138,7 +138,7 @@ def parse_line(line: bytes) -> Line:
         encoded = orjson.dumps(value)
     except (ValueError, TypeError) as error:
         raise VerificationError(f"a record is not JSON: {error}") from None
-    # A name twice, white space, an escape too many: what is written anew is not what was read.
+    # A name twice, white space, an escape too many: what is written again is not what was read.
     if encoded != line and _TOKEN.sub(_spelling_aside, encoded) != _TOKEN.sub(_spelling_aside, line):
         raise VerificationError("a record is not in its one form: no white space, no needless escapes, no name twice")
     is_stream = line.startswith(b'{"stream":{') and value.keys() == {"stream"}

@@ -68,7 +68,6 @@ class Capture:
     def __init__(self, rules: Sequence[TopicRule], *, source_kind: str, live: bool = False) -> None:
         """Raises ValueError with a sentence for a rule with a malformed pattern or field path."""
         self.lost: Counter[tuple[str, str]] = Counter()
-        self._digested: set[str] = set()  # topics of which a field was, which is said once
         self._topics: dict[str, _Topic | None] = {}
         self._source_kind = source_kind
         self._live = live
@@ -109,10 +108,6 @@ class Capture:
         if len(line) > MAX_LINE:
             why = f"its fields come to more than {MAX_LINE} bytes of JSON; choose fewer fields"
             return self._left_out(raw, Cause.RECORD_TOO_LARGE, why)
-        if conversion.digested and raw.topic not in self._digested:
-            self._digested.add(raw.topic)
-            text = "%s: %s is above %d bytes: its SM3 digest is captured instead"
-            log.warning(text, raw.topic, conversion.digested, topic.rule.limit)
         topic.schedule.captured(raw.received_ns)
         definition = raw.type_name, definition_line(raw.decoder)
         return Record(raw.topic, raw.received_ns, line, definition, topic.rule.trigger)

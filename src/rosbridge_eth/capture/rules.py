@@ -93,7 +93,7 @@ class Schedule:
         self._next = max(self._next or received_ns, received_ns) + self._period
 
     def _measure(self, received_ns: int) -> None:
-        """Keep the mean interval; begin anew when the clock stepped back."""
+        """Keep the mean interval; start again when the clock stepped back."""
         gap = 0 if self._latest is None else received_ns - self._latest
         self._latest = received_ns
         if gap < -self._period:

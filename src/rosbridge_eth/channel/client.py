@@ -90,7 +90,7 @@ class Client(Endpoint):
     now: monotonic seconds, the same clock in every call. wall, randomness: see Endpoint.
     server_name: the server's name in its certificate; None takes any server of the operator.
 
-    A session that is lost is made anew, after a growing wait.
+    A session that is lost is made again, after a growing wait.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Client(Endpoint):
         self._send_flight(now)
 
     def _send_flight(self, now: float) -> None:
-        """Send the handshake message that waits for its answer; the last of them is a probe, sealed anew each time."""
+        """Send the handshake message that waits for its answer; the last of them is a probe, sealed again each time."""
         self._outbox = [(datagram, self._address) for datagram in self._flight]
         if self._session is not None:
             self._session.sending.probe()

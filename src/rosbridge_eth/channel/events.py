@@ -106,7 +106,7 @@ class ClientConfig:
     mode: Mode = Mode.EXCHANGE
     """The one it uses; it never falls back to another."""
     attempt_timeout: float = 8.0
-    """A handshake that takes longer is begun anew."""
+    """A handshake that takes longer is started again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

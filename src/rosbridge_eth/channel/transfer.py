@@ -27,7 +27,7 @@ ACK_EVERY = 8
 """Packets after which the receiver answers without waiting for ACK_DELAY."""
 PROBES = 2
 OUTAGE = 3
-"""Unanswered probe timeouts after which the congestion window begins anew (RFC 9002, 7.6)."""
+"""Unanswered probe timeouts after which the congestion window starts again (RFC 9002, 7.6)."""
 LENGTH_SIZE = 4
 NEVER = float("inf")
 

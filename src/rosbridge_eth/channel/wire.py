@@ -142,7 +142,7 @@ class Assembly:
     def add(self, piece: bytes) -> bytes | None:
         """Take index, count and a piece of the body. The whole body once all its pieces have come, else None.
 
-        If the number of pieces changed: Malformed, and begun anew; one wrong piece must not keep the right ones out.
+        If the number of pieces changed: Malformed, and started again; one wrong piece must not keep the right ones out.
         """
         if len(piece) < 3 or not piece[0] < piece[1] <= MAX_PIECES:
             raise Malformed("a piece that does not exist, or is empty")

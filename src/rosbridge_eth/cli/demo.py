@@ -220,9 +220,9 @@ def demo(
     loss: Annotated[float, typer.Option(
         min=0, max=0.9, help="Lose this share of the datagrams.")] = 0.0,
 ) -> None:
-    """See it work: a bag onto a chain and back, proven and compared.
+    """See it work: a bag goes onto a chain and back, proven and compared.
 
-    All of it in this process, over real UDP, on a chain that is gone afterwards.
+    In one process, over real UDP, on a chain that ends with it.
 
     Exits with 9 if a single record is missing, altered or doubled.
     """

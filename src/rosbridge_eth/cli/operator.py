@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -42,9 +43,9 @@ from rosbridge_eth.terminal import (
 
 _CaPassphraseFile = Annotated[Path | None, typer.Option(help="Of a CA kept apart, where it has one of its own.")]
 _ReaderPassphraseFile = Annotated[Path | None, typer.Option(help="The passphrase of the reader's own keys.")]
-_ReplaceOption = Annotated[bool, typer.Option("--replace", help="Take a used name over; the old one ends.")]
+_ReplaceOption = Annotated[bool, typer.Option("--replace", help="Give a used name to a new one; the old one ends.")]
 _CompromisedOption = Annotated[
-    bool, typer.Option("--compromised", help="What it handed over and is not written becomes dead letters.")]
+    bool, typer.Option("--compromised", help="Chunks that are not on the chain yet become dead letters.")]
 
 FUNDS = 1000  # ETH that the operator has on a local chain
 
@@ -91,9 +92,9 @@ def up(
     passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Run all of it: an operator's home, chain, contract, server. For trying out and for small sites.
+    """Run everything: an operator's home, chain, contract, server. For trying out and for small sites.
 
-    What there is already is used: run again, it goes on. Ctrl-C ends server and chain and keeps both.
+    What exists is used, so it can be run again. Ctrl-C stops server and chain; both are kept.
     """
     from rosbridge_eth.ledger.nodes import Anvil, free_port, is_free
 
@@ -125,13 +126,13 @@ def up(
 
     def look() -> None:
         if anvil is not None and not anvil.running():
-            raise ChainError(f"the local chain ended by itself; what {state} has of it is kept: run `up` again")
+            raise ChainError(f"the local chain stopped by itself; its state is in {state}: run `up` again")
 
     with ExitStack() as stack:
         if port is not None and is_free(port):
             anvil = stack.enter_context(Anvil.start(port, state=state))
             anvil.fund(place.account, FUNDS)
-            talk(f"A local chain answers at {anvil.url}, kept in {state}.")
+            talk(f"A local chain runs at {anvil.url}; its state is in {state}.")
         if not deployed:
             for shard in range(settings.shards):  # a port that is taken is told before a contract is paid for
                 server_socket(settings.listen.next(shard)).close()
@@ -139,12 +140,12 @@ def up(
             if anvil is not None:
                 anvil.keeps(made.contract)  # a kill costs some seconds of the chain; without its contract, all of it
             talk(f"The contract is {made.contract} on chain {made.chain_id}.")
-        where = "" if home == OPERATOR_HOME else f" --home {home}"
+        where = "" if home == OPERATOR_HOME else f" --home {shlex.quote(str(home))}"
         talk("On a robot:    rosbridge-eth join")
         talk(f"Here, for it:  rosbridge-eth register NAME REQUEST{where}")
         talk("On the robot:  rosbridge-eth robot")
         _serve(place, secret, keys, look=look)
-    talk("Everything is kept: `up` goes on with it.")
+    talk("Everything is kept; run `up` again to continue.")
 
 
 def init(
@@ -173,7 +174,7 @@ def init(
         if ca_passphrase_file else None,
         keys=Keyring.from_mnemonic(words) if words else None,
     )
-    talk(f"{home} is an operator's home. Keep its passphrase: nothing in it can be recovered without.")
+    talk(f"{home} is an operator's home. Keep its passphrase: without it nothing can be recovered.")
     talk(f"{reader} is the home of the reader `owner`: carry it to the machine that reads; {home} opens no record.")
     talk(f"Robots are told to send to {load_server_config(place.config).addresses()[0]}.")
     talk(f"The operator's account is {keys.operator.address}; it pays for the contract and the robots.")
@@ -196,9 +197,9 @@ def chain(
     try:
         with Anvil.start(port, state=home / "chain.json", block_time=block_time) as anvil:
             anvil.fund(account, FUNDS)
-            talk(f"A local chain answers at {anvil.url}; {account} has {FUNDS} ETH. Ctrl-C ends and keeps it.")
+            talk(f"A local chain runs at {anvil.url}; {account} has {FUNDS} ETH. Ctrl-C stops it; its state is kept.")
             anvil.wait()
-            raise ChainError("the local chain ended by itself; start it again")
+            raise ChainError("the local chain stopped by itself; start it again")
     except KeyboardInterrupt:
         talk("The chain is kept.")
 
@@ -249,7 +250,7 @@ def register(
     try:
         answer = RobotHome(request.parent).answer  # where the request lies in the robot's home
         write_atomically(answer, made.bundle.read_bytes())  # which `robot` may look for at this moment
-        where = "" if request.parent == terminal.ROBOT_HOME else f" --home {request.parent}"
+        where = "" if request.parent == terminal.ROBOT_HOME else f" --home {shlex.quote(str(request.parent))}"
         talk(f"Run there now: rosbridge-eth robot{where}")
     except (OSError, ConfigError):
         talk(f"Carry {made.bundle} into the robot's home and run there: rosbridge-eth robot")
@@ -269,7 +270,7 @@ def add_reader(
     talk(f"{folder.path} is the home of reader {name}; carry it there. Its reader.toml names the node to ask.")
     talk(f"A robot registered before seals for it too once {folder.public} is in the robot's readers folder.")
     if replace:
-        talk(f"What was sealed for the old {name} only its own keys open.")
+        talk(f"What was sealed for the old {name} opens only with its old keys.")
 
 
 def revoke(
@@ -299,7 +300,7 @@ def renew(
     passphrase = passphrase_of(place, passphrase_file)
     ca = _ca(place, passphrase, ca_passphrase_file)
     old = enrolment.renew_server(place, ca=ca, passphrase=passphrase, now=utc_now())
-    talk(f"The server has new keys; those before are in {old}. Start the server again; robots need nothing.")
+    talk(f"The server has new keys; the old ones are in {old}. Restart the server; robots need no change.")
 
 
 def mnemonic(home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None) -> None:
@@ -311,9 +312,9 @@ def handover(
     to: Annotated[str | None, typer.Argument(help="The account of the operator's home that takes over.")] = None,
     home: OperatorHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Offer the contract to another operator, or take over an offer. The latter without an account.
+    """Offer the contract to another operator, or accept an offer. Without an account: accept.
 
-    Until it is taken over nothing changes, and another offer replaces this one. docs/operations.md has all steps.
+    Until it is accepted nothing changes, and another offer replaces this one. docs/operations.md has all steps.
     """
     from eth_utils.address import is_address, to_checksum_address
 
@@ -323,7 +324,7 @@ def handover(
     with ledger_of(place) as ledger:
         if to is not None:
             ledger.transact(keys.operator, "offerOperator", to_checksum_address(to))
-            talk(f"{ledger.contract} is offered to {to}; it changes hands when that home runs `handover`.")
+            talk(f"{ledger.contract} is offered to {to}; it takes effect when that home runs `handover`.")
         else:
             ledger.transact(keys.operator, "acceptOperator")
             talk(f"{keys.operator.address} is the operator of {ledger.contract}. Register each robot with --replace.")
@@ -341,7 +342,7 @@ def passwd(
     home: terminal.AnyHomeOption = OPERATOR_HOME, passphrase_file: PassphraseFile = None,
     new_passphrase_file: Annotated[Path | None, typer.Option(help="The new one, on the first line.")] = None,
 ) -> None:  # fmt: skip
-    """Put the keys of a home under another passphrase."""
+    """Change the passphrase of a home's keys."""
     old = read_passphrase("present", "Present passphrase", file=passphrase_file)
     new = read_passphrase("new", "New passphrase", file=new_passphrase_file, confirm=True)
     files = enrolment.change_passphrase(home, old, new)
@@ -355,7 +356,7 @@ def server(
     passphrase_file: PassphraseFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Take chunks from robots and bring them onto the chain."""
+    """Receive chunks from robots and write them to the chain."""
     log_to_stderr(log_format, verbose)
     _serve(*_opened(home, passphrase_file), shard or ())
 
@@ -364,7 +365,7 @@ def _serve(
     place: OperatorHome, passphrase: bytes, keys: Keyring, only: Sequence[int] = (),
     look: Callable[[], None] = lambda: None,
 ) -> None:  # fmt: skip
-    """Run the server, or these shards of it; what `look` raises ends it in good order."""
+    """Run the server, or these shards of it; what `look` raises ends it in order."""
     secrets = Secrets(enrolment.load_server_identity(place, passphrase), keys)
 
     def ready(addresses: list[Address]) -> None:

@@ -47,9 +47,9 @@ At: TypeAlias = Annotated[str | None, typer.Option(help="Only the last record of
 Nodes: TypeAlias = Annotated[list[str] | None, typer.Option(
     "--node", help="Ask these nodes, not those of reader.toml.")]
 Confirmations: TypeAlias = Annotated[int, typer.Option(
-    min=1, max=100_000, help="Read up to the block that has so many, itself counted.")]
+    min=1, max=100_000, help="Read up to the block that has this many confirmations, itself counted.")]
 Confirm: TypeAlias = Annotated[bool, typer.Option(
-    "--confirm", help="The fingerprints of new certificates are compared and right.")]
+    "--confirm", help="I compared the fingerprints of new certificates; they are right.")]
 
 
 def _time(text: str | None, *, end: bool = False) -> int | None:
@@ -65,7 +65,7 @@ def _time(text: str | None, *, end: bool = False) -> int | None:
 def _choice_of(topic: str | None, from_: str | None, to: str | None, at: str | None) -> Choice:
     choice = Choice(topic, _time(from_), _time(to, end=True), _time(at))
     if choice.at_ns is not None and (choice.from_ns is not None or choice.to_ns is not None):
-        raise typer.BadParameter("a moment has no range: give --at, or --from and --to", param_hint="--at")
+        raise typer.BadParameter("give --at, or --from and --to, not both", param_hint="--at")
     if choice.from_ns is not None and choice.to_ns is not None and choice.from_ns >= choice.to_ns:
         raise typer.BadParameter(f"{from_} is not before --to {to}", param_hint="--from")
     return choice
@@ -92,7 +92,7 @@ def read(
     node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Print what a robot wrote, verified, from the chain. As JSON lines, bag, table or plot.
+    """Read a robot's records from the chain, verified. As JSON lines, bag, table or plot.
 
     What is proven is kept in the reader's home, sealed, so the next time only what is new is asked for. Exits with 9
     where what the chain has is not what the robot wrote, or not all of it, and with 4 where every record of it is
@@ -103,13 +103,13 @@ def read(
         raise typer.BadParameter("name the picture with --plot", param_hint="--field")
     address = _address(serve)
     if address is not None and not follow:
-        raise typer.BadParameter("a page shows what comes: give --follow, too", param_hint="--serve")
+        raise typer.BadParameter("--serve needs --follow", param_hint="--serve")
     if follow and choice.at_ns is not None:
-        raise typer.BadParameter("a moment does not go on: leave one of the two", param_hint="--follow")
+        raise typer.BadParameter("give --at or --follow, not both", param_hint="--follow")
     if follow and bag is not None and bag.suffix != ".mcap":
         raise typer.BadParameter(f"only an .mcap file can be read while it grows, not {bag}", param_hint="--bag")
     if len(robot) > 1 and (address is None or bag or table or plot):
-        raise typer.BadParameter("a file has one robot's records; several are for --serve", param_hint="ROBOT")
+        raise typer.BadParameter("several robots need --serve, and no --bag, --table or --plot", param_hint="ROBOT")
     for path, check in ((bag, outputs.check_bag), (table, outputs.check_table), (plot, outputs.check_picture)):
         if path is not None:
             check(path)
@@ -165,7 +165,7 @@ def compare(
     node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Compare a recording of your own with what the chain has. Message by message, field by field.
+    """Compare a recording with the chain. Message by message, field by field.
 
     Exits with 9 if a record is missing, altered or doubled, or none is there to compare.
     """
@@ -182,7 +182,7 @@ def compare(
     if made.wrong > len(made.differences):
         talk(f"and {made.wrong - len(made.differences):,} differences more")
     if made.absent:
-        talk(f"the chain has nothing of the bag's time on {', '.join(made.absent)}")
+        talk(f"the chain has no record from the bag's time on {', '.join(made.absent)}")
     talk(f"equal to the bag's: {counted(made.equal, 'record')}; {counted(made.wrong, 'difference')}")
     reader.require_sound(robot, said)
     if made.wrong or not made.equal:
@@ -204,7 +204,7 @@ def evidence(
     if choice == _choice_of(None, None, None, None):
         raise typer.BadParameter("say which records: --topic, --at, or --from and --to", param_hint="--topic")
     if file.exists() or not file.parent.is_dir():
-        raise ConfigError(f"{file} is there already, or its folder is not; name a new file")
+        raise ConfigError(f"{file} exists already, or its folder does not; name a new file")
     with (
         closing(_Reader(home, node, confirmations, confirm, passphrase_file)) as reader,
         reader.reading(robot) as (reading, said),
@@ -251,7 +251,7 @@ def verify(
     for line in found.proves_not(asked):
         talk(f"- {line}")
     if data.strip().decode() not in (given.encode(), given.page().strip()):
-        talk("The page around it is not as this version writes it: go by what stands here, and not by what it shows.")
+        talk("The page differs from the one that this version writes: rely on this output, not on the page.")
 
 
 def grant(
@@ -264,7 +264,7 @@ def grant(
     node: Nodes = None, confirmations: Confirmations = 1, confirm: Confirm = False,
     passphrase_file: PassphraseFile = None,
 ) -> None:  # fmt: skip
-    """Open a span of a robot's log to somebody who is no reader of it. Nothing goes on the chain.
+    """Let somebody else read a time span of a robot's log. Nothing goes on the chain.
 
     They put the file into `grants/` of their own home, and `read` opens these chunks. It cannot be taken back.
     """
@@ -275,7 +275,7 @@ def grant(
         peer = own.trust.check(*peer.pair, role=Role.READER, at=now)
         out = out or Path(f"{robot}-{peer.name}.grant")
         if out.exists():
-            raise ConfigError(f"{out} is there already; name another with --out")
+            raise ConfigError(f"{out} exists already; name another with --out")
         with own.reading(robot) as (reading, said):
             keys = granting.keys_of(reading, choice)
         if not keys:

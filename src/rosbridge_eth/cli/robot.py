@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, closing, nullcontext, suppress
 from pathlib import Path
@@ -16,8 +16,7 @@ from types import FrameType
 from typing import Annotated
 
 import typer
-from rich.console import Group, RenderableType
-from rich.text import Text
+from rich.console import RenderableType
 
 from rosbridge_eth import terminal
 from rosbridge_eth.config import RobotConfig, load_robot_config, parse_config
@@ -28,13 +27,14 @@ from rosbridge_eth.errors import ConfigError, StoreError
 from rosbridge_eth.identity import check_name
 from rosbridge_eth.log.chunk import STREAM_SIZE
 from rosbridge_eth.operator import bundle as bundles
+from rosbridge_eth.operator.status import robot_picture
 from rosbridge_eth.reading.verdict import grouped
-from rosbridge_eth.robot.loop import Robot, open_robot, read_again
+from rosbridge_eth.robot.loop import open_robot, read_again
 from rosbridge_eth.robot.sources import Offer, Selection
 from rosbridge_eth.robot.topics import ANYTHING, PLUMBING, SourceOption, everything, offered, robot_toml
 from rosbridge_eth.server import metrics
 from rosbridge_eth.server.parent import notify
-from rosbridge_eth.terminal import LogFormat, errors, live, log_to_stderr, one_line, plain, table, talk
+from rosbridge_eth.terminal import LogFormat, errors, live, log_to_stderr, table, talk
 
 SOURCES = {"bag": "a bag", "ros1": "the live ROS 1 graph", "ros2": "the live ROS 2 graph", "sim": "a SIMULATED robot"}
 """Kinds of source, as a person is told of them."""
@@ -47,7 +47,7 @@ def join(
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
     source: SourceOption = None,
     topic: Annotated[list[str] | None, typer.Option(help="Topics, by name or pattern; else you are asked.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: all topics of the ROS that is there.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: take all topics that are found.")] = False,
     password_file: terminal.PasswordFile = None,
 ) -> None:
     """Make this machine a robot: its keys, topics, and a request. The operator's `register` answers it.
@@ -69,7 +69,7 @@ def join(
     password = read_passphrase("robot", f"Password for the keys of {name}", file=password_file, confirm=True)
     bundles.ask_to_join(place, name, password, config)
     talk(f"{home} has the keys of {name}; they never leave it. {place.config} says what it sends.")
-    talk(f"The operator runs now: rosbridge-eth register {name} {place.request}")
+    talk(f"The operator runs now: rosbridge-eth register {name} {shlex.quote(str(place.request))}")
 
 
 def _first_config(place: RobotHome, source: str | None, topics: list[str], *, asks: bool, yes: bool) -> str:
@@ -132,7 +132,7 @@ def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> No
 
 def _say_who(joined: bundles.Joined) -> None:
     talk(f"The operator's CA is {grouped(joined.ca)}; compare it with what `register` showed.")
-    talk(f"It says that these may read what this robot writes: {', '.join(joined.readers) or 'nobody'}.")
+    talk(f"Readers who can open this robot's records: {', '.join(joined.readers) or 'nobody'}.")
 
 
 def robot(
@@ -140,7 +140,7 @@ def robot(
     password_file: terminal.PasswordFile = None, verbose: terminal.Verbose = 0,
     log_format: terminal.LogFormatOption = LogFormat.TEXT,
 ) -> None:  # fmt: skip
-    """Bring what the configured topics say to the server. Ends when it is stopped, or the source ends.
+    """Capture the configured topics and send them to the server. Ends when it is stopped, or the source ends.
 
     SIGHUP: topics, nodes, triggers, [capture] and readers are read again. SIGUSR1: all triggers.
     """
@@ -172,8 +172,13 @@ def robot(
             signal.signal(number, on_signal)
         stack.enter_context(metrics.served(settings.monitor))
         talk(f"{end.robot} sends to {end.server_name} at {settings.server or end.addresses()[0]}; Ctrl-C ends it.")
-        beats, rates, told = metrics.Beats(1.0), metrics.Rates(), not errors.is_terminal
-        show = stack.enter_context(live(lambda: _picture(end.robot, running, rates)))
+        beats, told, sender = metrics.Beats(1.0), not errors.is_terminal, running.sender
+
+        def picture() -> RenderableType:
+            session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
+            return robot_picture(end.robot, session, metrics.figures())
+
+        show = stack.enter_context(live(picture))
 
         def on_turn() -> None:
             nonlocal settings, told
@@ -188,11 +193,10 @@ def robot(
                     notify("WATCHDOG=1")
                     for name in _asked_for(place, running.box.triggers):
                         running.fire("asked for", name)
-                    newest, block = running.sender.newest, running.sender.block
-                    if not told and running.writer.stream and newest[:STREAM_SIZE] == running.writer.stream:
+                    if not told and running.writer.stream and sender.newest[:STREAM_SIZE] == running.writer.stream:
                         told = True
-                        before = " or before" if any(newest[STREAM_SIZE:]) else ""
-                        talk(f"The first record is in block {block}{before}.")
+                        before = " or before" if any(sender.newest[STREAM_SIZE:]) else ""
+                        talk(f"The first record is in block {sender.block}{before}.")
                     metrics.show(metrics.of_robot(end.robot, running, time.time()))
                     metrics.save(metrics.file_of(home, "robot"))
                 show()
@@ -207,9 +211,9 @@ def trigger(
     name: Annotated[str | None, typer.Argument(help="One of them; without it, all.")] = None,
     home: terminal.RobotHomeOption = terminal.ROBOT_HOME,
 ) -> None:
-    """Have the robot write what it keeps in memory for an event. It runs with this home; the event is now."""
+    """Trigger an event now. The robot that runs with this home writes what it has in memory."""
     (place := RobotHome(home)).bridge()
-    nobody = ConfigError(f"no robot that has this trigger runs with {home}, so nothing is kept in memory")
+    nobody = ConfigError(f"no robot runs with the home {home}, or it has no trigger: nothing is kept in memory")
     if (figures := metrics.running(home).get("robot")) is None:
         raise nobody
     known = [labels["trigger"] for what, labels, _ in figures if what == "trigger_fired"]
@@ -233,36 +237,3 @@ def _asked_for(place: RobotHome, triggers: Iterable[str]) -> list[str]:
     for name in asked:
         place.event(name).unlink(missing_ok=True)
     return asked
-
-
-def _picture(name: str, running: Robot, rates: metrics.Rates) -> RenderableType:
-    """What a person at the terminal sees: topics, chunks, session."""
-    now, lost = time.monotonic(), Counter[str]()
-    for (topic, _), count in running.lost.items():
-        lost[topic] += count
-    kept = [
-        f"Trigger {each.rule.name}: {len(each.ring)} records in memory, {each.ring.bytes / 2**20:.1f} of"
-        f" {each.rule.memory / 2**20:.1f} MiB; events: {each.fired}." for each in running.box.triggers.values()
-    ]
-    spool, sender = running.spool.statistics(), running.sender
-    written, sealed, confirmed = running.written, running.writer.sealed, running.confirmed()
-    # Else some of what is below the newest confirmed place is not there.
-    known = not sender.refused and not spool.dropped_bodies
-    rows = [
-        (topic, f"{rates.of(topic, written[topic], now):.1f}", written[topic], sealed[topic],
-         *((sealed[topic] - confirmed[topic], confirmed[topic]) if known else "??"), lost[topic])
-        for topic in sorted({*written, *lost})
-    ]  # fmt: skip
-    where = f" (the last in block {sender.block})" if sender.block else ""
-    session = sender.held or ("connected" if sender.connected else sender.refusal or "no session yet")
-    columns = ["topic", "records/s", "records", "sealed", "waiting", "confirmed", "lost"]
-    return Group(
-        table(name, columns, rows, right=range(1, 7)),
-        *map(plain, kept),
-        Text(
-            f"Chunks: {running.chunks} sealed, {spool.unstored} wait for the server,"
-            f" {spool.chunks - spool.unstored} for the chain, {sender.confirmed} confirmed{where}."
-            f" Session: {one_line(session)}.",
-            no_wrap=False, overflow="fold",  # why there is no session is longer than a line
-        ),
-    )

@@ -1,7 +1,7 @@
 """The folders the commands work in: what stands where at the operator's end, on a robot, and at a reader's.
 
 Each has a `home.json` that says whose home it is; it is written last, so a home that was cut short is none: its
-`.unfinished` is left, and who makes a home there begins anew. While a shard of the server or a robot runs,
+`.unfinished` is left, and who makes a home there starts again. While a shard of the server or a robot runs,
 `.shard-0.json` or `.robot.json` is what it counts (metrics).
 
 An operator's home (made by `init`); it holds no reader's key and no robot's:
@@ -40,6 +40,7 @@ A reader's home (made by `init` or `reader`, to be carried to the machine that r
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -280,7 +281,7 @@ class RobotHome:
         self._head()
         absent = ConfigError(
             f"this robot has no certificates yet: carry {self.request} to the operator, whose `register` answers with"
-            f" a bundle; put that into {self.path} and run `robot --home {self.path}`"
+            f" a bundle; put that into {self.path} and run `robot --home {shlex.quote(str(self.path))}`"
         )
         return _load(BridgeEnd, self.bridge_file, "join again", absent)
 

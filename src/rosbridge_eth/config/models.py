@@ -236,7 +236,6 @@ class SimConfig(Section):
 
     robot: NAME.
 
-    seed: The same seed drives the same way.
 
     rate: Messages per second.
 
@@ -247,7 +246,6 @@ class SimConfig(Section):
 
     kind: Literal["sim"]
     robot: TopicPart = "robot_1"
-    seed: int = Field(default=1, ge=0, lt=2**63)
     rate: float = Field(default=10.0, ge=1e-6, le=10_000)
     duration: DurationNs | None = None
     speed: Speed = 1.0
@@ -469,7 +467,7 @@ class ServerConfig(Section):
         first, *others = self.public or [self.listen]
         if lost := [address for address in (first, *others) if address.nowhere]:
             raise ConfigError(
-                f"robots would be told to send to {lost[0]}, which is no machine's address: write into server.toml"
+                f"robots would be told to send to {lost[0]}, which no machine can have: write into server.toml"
                 ' public = "HOST:PORT", as robots reach the server'
             )
         return [first, *others] if others else [first.next(shard) for shard in range(self.shards)]

@@ -34,7 +34,7 @@ def read_passphrase(
     """The passphrase called `name` ("operator", "robot", "reader", "ca"), without its line end.
 
     Looked for in `file`, then where `passphrase_file` says, then asked for (twice with `confirm`). IdentityError
-    where there is none to be had.
+    where there is none.
     """
     if file := file or passphrase_file(name, environment):
         return _from_file(file)

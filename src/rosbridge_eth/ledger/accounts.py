@@ -62,7 +62,7 @@ class Keyring:
         return keyring
 
     def account(self, number: int) -> LocalAccount:
-        """m/44'/60'/0'/0/number."""
+        """m/44'/60'/0'/0/number: 0 is the operator's, n that of the n-th enrolment."""
         if not 0 <= number < 2**31:
             raise IdentityError(f"an account's number is in [0, 2**31), not {number}")
         if number not in self._accounts:
@@ -74,12 +74,6 @@ class Keyring:
     def operator(self) -> LocalAccount:
         """Account 0: owns the contract and pays for the others."""
         return self.account(0)
-
-    def robot(self, number: int) -> LocalAccount:
-        """The account of an enrolment; numbers count from 1."""
-        if number < 1:
-            raise IdentityError("robots' accounts count from 1; number 0 is the operator's")
-        return self.account(number)
 
     # ------------------------------------------------------------------ at rest
 

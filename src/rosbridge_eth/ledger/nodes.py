@@ -83,7 +83,7 @@ _WITH_US = 'exec 3<&0; { read -r _ <&3; kill -KILL 0; } & exec "$@" </dev/null 3
 
 
 def is_free(port: int) -> bool:
-    """Whether a TCP port of 127.0.0.1 can be had."""
+    """Whether a TCP port of 127.0.0.1 is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -173,7 +173,7 @@ class Anvil:
             answer: Any = self._provider.make_request(method, params)
             return answer["result"]
         except (OSError, ValueError, KeyError) as error:
-            raise ChainError(f"anvil does not do {method}: {error}") from error
+            raise ChainError(f"anvil refuses {method}: {error}") from error
 
     @property
     def pid(self) -> int:

@@ -4,7 +4,7 @@ WAL mode, one fsync a commit: what was committed survives the loss of power. A p
 to the file needs room on the disk a second time, when it is copied there, and as long as it cannot be copied
 nothing at all can be written, not even what removes. So a file FILE.reserve keeps that room: the log is copied
 every `wal_pages`, and a write that finds the disk full removes the reserve, has the log copied, and is tried again.
-As long as the reserve cannot be made anew, the file may not grow: rows can be removed, and others take their place.
+As long as the reserve cannot be made again, the file may not grow: rows can be removed, and others take their place.
 """
 
 from __future__ import annotations
@@ -47,6 +47,18 @@ def _code(error: sqlite3.Error) -> int:
     return getattr(error, "sqlite_errorcode", 0) & 0xFF
 
 
+def _make(path: Path) -> None:
+    """An empty file for its owner alone, unless there is one, which is not opened: to close it would drop the locks
+    of this process's other connections (sqlite.org/howtocorrupt.html, 2.2), and the next process that closes the file
+    would then remove its log. OSError if it cannot be written.
+    """
+    try:
+        os.utime(path)
+    except FileNotFoundError:
+        with suppress(FileExistsError):
+            os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+
+
 class Database:
     """One file. An object belongs to one thread; open one per process, after forking.
 
@@ -69,16 +81,17 @@ class Database:
             raise self._nothing
         try:
             if not read_only:
-                os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+                _make(path)
         except OSError as error:
             raise StoreError(f"the {what} {path} cannot be opened: {error.strerror}") from None
         # Without a log there is nothing that it could add, and SQLite would make one even to read.
         unused = read_only and not path.with_name(path.name + "-wal").exists()
         mode = ("?mode=ro" if read_only else "?mode=rw") + ("&immutable=1" if unused else "")
-        self._db = sqlite3.connect(
-            path.absolute().as_uri() + mode, uri=True, timeout=0.2 if exclusive or read_only else BUSY_TIMEOUT,
-            isolation_level=None, check_same_thread=False,
-        )  # fmt: skip
+        with self.errors():
+            self._db = sqlite3.connect(
+                path.absolute().as_uri() + mode, uri=True, timeout=0.2 if exclusive or read_only else BUSY_TIMEOUT,
+                isolation_level=None, check_same_thread=False,
+            )  # fmt: skip
         self._file = path.stat()
         try:
             self._open(application, schema, read_only)

@@ -164,7 +164,7 @@ class RedisStore(Store):
     """`Store` in a Redis. An object belongs to one thread; open one per process, after forking.
 
     Stores of other ledgers in the same Redis are apart from it; those of the same one are one. A call that cannot be
-    carried out raises StoreError, and the next one connects anew.
+    carried out raises StoreError, and the next one connects again.
     """
 
     def __init__(self, url: str, ledger: bytes, max_bytes: int, max_bytes_per_robot: int) -> None:

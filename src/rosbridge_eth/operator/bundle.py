@@ -128,7 +128,7 @@ def read_bundle(data: bytes, password: bytes | None = None) -> Bundle:
         raise IdentityError("this bundle file was damaged") from None
     for address in addresses:
         if address.nowhere:
-            raise IdentityError(f"this bundle tells its robot to send to {address}, which is no machine's address")
+            raise IdentityError(f"this bundle tells its robot to send to {address}, which no machine can have")
     return bundle
 
 
@@ -162,7 +162,7 @@ class Joined(NamedTuple):
 def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> Joined:
     """Complete a robot's home with the bundle that answers its request, or make it of a bundle that holds keys.
 
-    A home may join again where its keys were certified anew; its readers are then those of the bundle alone. A bundle
+    A home may join again where its keys were certified again; its readers are then those of the bundle alone. A bundle
     that was made before the one that the home has is refused: its readers may have been revoked since. A reader whose
     certificates end later is left out where the robot seals (robot.reader_keys), by its clock.
     """

@@ -111,7 +111,7 @@ def disk(home: Home, secret: bytes | None) -> Findings:
 
 
 def certificates(folder: Path, renewal: str) -> Findings:
-    """Are the certificates in a folder in force, and for how long? renewal: how they are made anew."""
+    """Are the certificates in a folder in force, and for how long? renewal: how they are made again."""
     now = datetime.now(UTC)
     for path in sorted(folder.glob("*.crt.pem")):
         for each in ids.read_certificates(path.read_bytes()):
@@ -196,7 +196,7 @@ def bridge(home: RobotHome, secret: bytes | None) -> Findings:
     yield ok("configuration", str(home.config))
     place = config.server or end.addresses()[0]
     if place.nowhere:
-        yield broken("bridge", f"it was told to send to {place}, which is no machine's address",
+        yield broken("bridge", f"it was told to send to {place}, which no machine can have",
                      'write server = "HOST:PORT", as the server is reached, into robot.toml')
     else:
         yield ok("bridge", f"{end.robot} sends to {end.server_name} at {place}")
@@ -229,7 +229,7 @@ def session(home: RobotHome, secret: bytes | None) -> Findings:
     metrics.require_free(config.monitor)
     yield ok("robot", "does not run; its ports are free")
     if secret is None:
-        yield skipped("server", f"{server} not tried: it takes the robot's keys to be let in", "give --passphrase-file")
+        yield skipped("server", f"{server} not tried: a session needs the robot's keys", "give --passphrase-file")
         return
     identity, roots = ids.load_identity(home.identity, secret)
     yield ok("password", f"opens the keys of {identity.name}")
@@ -270,7 +270,7 @@ def try_session(
 
 
 def own_keys(home: ReaderHome, secret: bytes | None) -> Findings:
-    yield from certificates(home.path, "let the operator make this reader anew (`reader NAME --replace`)")
+    yield from certificates(home.path, "let the operator make this reader again (`reader NAME --replace`)")
     if secret is None:
         yield skipped("passphrase", "none was given", "give --passphrase-file")
     else:
@@ -319,7 +319,7 @@ def doctor(
         "--passphrase-file", help="Of this home's keys (a robot's password), to try them.")] = None,
     json: Json = False,
 ) -> None:
-    """Check all that a home depends on, and name the fix. An operator's, a robot's, a reader's.
+    """Check everything a home depends on, and name the fix. An operator's, a robot's, a reader's.
 
     Exits with 1 if something is broken.
     """

@@ -321,7 +321,7 @@ def register_robot(
             registry.require_free(Role.ROBOT, name)
             if standing.account is not None:
                 raise IdentityError(
-                    f"robot {name!r} was revoked; give --replace to enrol it anew, with a new account and new keys"
+                    f"robot {name!r} was revoked; give --replace to enrol it again, with a new account and new keys"
                     if standing.revoked else
                     f"the contract knows a robot {name!r} that the registry does not; give --replace to take it over"
                 )
@@ -367,7 +367,7 @@ def _register(
     put = ledger.registration if standing.account is None else ledger.replace_registration
     number = registry.next_number()
     while True:
-        account = keys.robot(number).address
+        account = keys.account(number).address
         try:
             return number, account, put(keys.operator, tk, account, certificates).block
         except Reverted as refused:
@@ -416,8 +416,8 @@ def revoke(
     """Take a name out of force: the server closes its session at once, the contract ends its right to write.
 
     The registry comes first: from then on the server refuses the name, whatever the chain does. What the server has
-    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters, and what a
-    worker with a slow disk took later when it is run again.
+    of it is given LAST_WRITES seconds to be written, none with `compromised`; the rest becomes dead letters. Run it
+    again for chunks that were stored after it.
     ChainError, StoreError: half done; it is run again when node and store answer.
     """
     with Registry(home.registry) as registry:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -250,13 +250,24 @@ def of_robot(place: RobotHome) -> Report:
                 report["unknown"].append(("robot", _SILENT))
             report["alarms"] += [("log", FORKED) for name, _, value in running
                                  if name == "forked_seconds" and time.time() - value < FORKED_FOR]  # fmt: skip
-            wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
-                      "trigger_records")  # fmt: skip
-            report["figures"] = {
-                " ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
-                for name, labels, value in running if name in wanted
-            }  # fmt: skip
+            report["figures"] = _of_robot(running)
     return report
+
+
+def _of_robot(running: Iterable[Figure]) -> dict[str, float]:
+    wanted = ("captured", "connected", "lost", "spool_bytes", "spool_chunks", "spool_dropped", "trigger_fired",
+              "trigger_records")  # fmt: skip
+    return {" ".join([name, *(text for label, text in labels.items() if label != "robot")]): value
+            for name, labels, value in running if name in wanted}  # fmt: skip
+
+
+def robot_picture(name: str, session: str, running: Iterable[Figure]) -> RenderableType:
+    """The picture of a running robot at its terminal, from its own figures."""
+    return table(name, ["what", "value"], [("session", session), *_rows(_of_robot(running))])
+
+
+def _rows(figures: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    return ((name.replace("_", " "), f"{value:,.0f}") for name, value in figures.items())
 
 
 # What is shown
@@ -330,7 +341,7 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("server", report["server"]), ("topics, nodes", ", ".join([*report["topics"], *report["nodes"]])),
         ("contract", report["contract"]), ("chain", report["chain"]), ("runs", "yes" if report["runs"] else "no"),
         ("spool", kept), *_process(report),
-        *((name.replace("_", " "), f"{value:.0f}") for name, value in report.get("figures", {}).items()),
+        *_rows(report.get("figures", {})),
     ])  # fmt: skip
     yield from _alarms(report)
 
@@ -346,7 +357,7 @@ def _look(path: Path, robot: str | None) -> tuple[Report, list[RenderableType]]:
                 raise ConfigError(f"{path} is the home of one robot; leave its name out")
             shown = _show_robot(report := of_robot(RobotHome(path)))
         case HomeKind.READER:
-            raise ConfigError(f"a reader's home has nothing that goes on; try it with `doctor --home {path}`")
+            raise ConfigError(f"{path} is a reader's home, which has no status; run `doctor --home {path}`")
     return {"kind": kind, **report}, [plain(each) if isinstance(each, str) else each for each in shown]
 
 
@@ -354,7 +365,7 @@ def status(
     robot: Annotated[str | None, typer.Argument(help="This one alone, and how far its log is on the chain.")] = None,
     home: AnyHomeOption = OPERATOR_HOME, json: Json = False,
 ) -> None:  # fmt: skip
-    """Show what is where: robots, what waits, balances, alarms. Of an operator's home, or a robot's.
+    """Show the state: robots, waiting chunks, balances, alarms. Of an operator's home, or a robot's.
 
     What cannot be known, because node, store or server do not answer, is said. Exits with 7 where the node is on
     another chain than the contract.

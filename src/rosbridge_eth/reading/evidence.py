@@ -60,7 +60,7 @@ Count = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 class _Part(BaseModel):
-    # A member too many shows when the file is written anew; pydantic's errors for a million of them fill the memory.
+    # A member too many shows when the file is written again; pydantic's errors for a million of them fill the memory.
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True, ser_json_bytes="hex", val_json_bytes="hex")
 
 

@@ -1,7 +1,7 @@
 """Following: the same reading asked again when the chain has come on, of which only what is new is given.
 
 Nothing is remembered of the chain but what the reading before ended with. A reading goes on behind it where the chain
-is the same up to there; where it is not (a reorganisation), or a node failed in the middle, it begins anew.
+is the same up to there; where it is not (a reorganisation), or a node failed in the middle, it starts again.
 
 Not here: waiting, and what is made of the records.
 """

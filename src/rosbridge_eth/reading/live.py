@@ -135,7 +135,7 @@ def _text(value: Any) -> str:
 
 
 class Page:
-    """Serves a view from threads of its own until `close`. NetworkError where the address cannot be had."""
+    """Serves a view from threads of its own until `close`. NetworkError where the address cannot be opened."""
 
     def __init__(self, address: Address, view: View) -> None:
         files = resources.files(__package__)
@@ -207,7 +207,7 @@ class _Handler(BaseHTTPRequestHandler):
         if re.sub(r":\d+$", "", self.headers.get("Host", "")).strip("[]").lower() not in self.names:
             self._send(HTTPStatus.FORBIDDEN, b"this page is shown under this machine's own address only\n")
         elif self.path == "/events" and self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            # Another site's page cannot read them, but could take up all the room.
+            # Another site's page cannot read them, but could use all the connections.
             self._send(HTTPStatus.FORBIDDEN, b"these events are for this page only\n")
         elif self.path == "/events":
             self._send_events()

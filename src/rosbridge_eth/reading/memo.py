@@ -82,5 +82,5 @@ class Memo:
             self._db.close()
         self._db = None
         if isinstance(error, sqlite3.DatabaseError) and not isinstance(error, sqlite3.OperationalError):
-            with suppress(OSError):  # damaged: the next reading begins it anew
+            with suppress(OSError):  # damaged: the next reading begins it again
                 self._path.write_bytes(b"")

@@ -416,7 +416,7 @@ class Verifier:
         return self.shown_all and not counts[Kind.ROLLED_BACK.label] and not counts[Kind.CONTRADICTED.label]
 
     def progress(self) -> Progress:
-        """Where the reading stands, between two chunks. New certificates are not in it: they are told anew."""
+        """Where the reading stands, between two chunks. New certificates are not in it: they are told again."""
         kept = [one for one in self.findings.kept if one.kind is not Kind.NEW_CERTIFICATE]
         found = {label: count for label, count in self.findings.counts.items() if label != Kind.NEW_CERTIFICATE.label}
         return deepcopy(replace(self._at, tail=self._tail(), found=found, findings=kept))

@@ -15,7 +15,7 @@ import os
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -31,7 +31,6 @@ from rosbridge_eth.config.values import Address, counted, parse_address
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import MAX_READERS, STREAM_SIZE, Chunk, Log, drop, robot_id
-from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
@@ -49,12 +48,10 @@ LIVE_BYTES = 128 << 20  # and where it cannot: twice the largest message that is
 TAKE = 128  # raw messages captured before the network gets its turn again
 GATHER = 0.05  # seconds that messages gather in the queue: a turn of the loop costs as much as some of them
 LONGEST_WAIT = 0.25
-LOSSES_EVERY = 1.0  # seconds between looks at what capture refused and the source lost
+LOOK_EVERY = 1.0  # seconds between looks at what was lost, and at whether the kernel's clock is synchronised
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
-SYNCHRONISED_EVERY = 10.0  # seconds between questions to the kernel whether its clock is synchronised
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
-MARKS = 512  # places of the log for which it is known how many records of each topic they end
 LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
 
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
@@ -77,16 +74,14 @@ class Robot:
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
         self.client, self.sender, self.loop = client, sender, ClientLoop(client, servers, self.handle)
         self.source, self.chunks = source, 0
-        self.written = Counter[str]()
-        """Records given to the writer, by topic."""
-        self._marks: deque[tuple[bytes, Counter[str]]] = deque()  # place, and records sealed up to there
-        self._confirmed = Counter[str]()
+        self.captured = 0
+        """Records given to the writer; what is kept in memory for an event is not among them."""
         self._queue = Queue(LIVE_BYTES if source.live else REPLAYED_BYTES, waits=not source.live)
         self._stop, self._source_ended = threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
         self._unspooled: deque[Chunk] = deque()
-        self._failing: dict[str, str] = {}  # what the spool does not do at this moment, and why
-        self._spool_at = self._send_at = self._losses_at = self._synchronised_at = self._take_at = float("-inf")
+        self._failing: dict[str, tuple[str, float]] = {}  # what the spool does not do now: why, and when it is retried
+        self._look_at = self._take_at = float("-inf")
         self._synchronised = self._finished = False
         self.summary = ""
         """What became of everything, in one line, after `run`."""
@@ -122,21 +117,6 @@ class Robot:
     def _source_lost(self) -> dict[tuple[str, str], int]:
         return {**self.source.lost, **self._queue.lost}
 
-    @property
-    def captured(self) -> int:
-        """Records given to the writer; what is kept in memory for an event is not among them."""
-        return self.written.total()
-
-    def confirmed(self) -> Counter[str]:
-        """Records confirmed on the chain since the start, by topic: those up to the newest place that is confirmed.
-
-        A chunk holds records of all topics, so what is kept are places of the log and not records. Of more than MARKS
-        places that wait every second is left out: then it is less, by less than what one of them stands for.
-        """
-        while self._marks and self._marks[0][0] <= self.sender.newest:
-            self._confirmed = self._marks.popleft()[1]
-        return self._confirmed
-
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
 
@@ -159,7 +139,7 @@ class Robot:
                 self.loop.seek(now)
                 self._send(now)
                 on_turn()
-                if self._finished and not self._unspooled and self._spool_or(False, "idle", lambda: self.sender.idle):
+                if self._finished and not self._unspooled and self._idle(False, now):
                     break
                 self.loop.step(self._wait(now))
             else:
@@ -169,7 +149,7 @@ class Robot:
                     self._spool_chunks(self.writer.closed(now, time.time_ns() // 10**6), now)
                 if not self._finished:
                     self._finish(time.monotonic())
-                self._spool_at = float("-inf")  # the last chunks do not wait
+                self._failing.clear()  # the last chunks do not wait
                 self._spool_chunks([], time.monotonic())
                 self._last_words()
         finally:
@@ -181,7 +161,7 @@ class Robot:
             finally:
                 self.source.close()
                 reading.join(timeout=5)
-                self.summary = self._spool_or("the spool cannot be read", "sum", self._summarise)
+                self.summary = self._spool_or("the spool cannot be read", "sum", time.monotonic(), self._summarise)
                 self.spool.close()
                 self.loop.close()
         if self._source_error is not None:
@@ -208,8 +188,10 @@ class Robot:
     # The loop's thread
 
     def _take(self, now: float) -> None:
-        if now - self._synchronised_at > SYNCHRONISED_EVERY:
-            self._synchronised, self._synchronised_at = clock_synchronised(), now
+        if now >= self._look_at:
+            self._look_at, self._synchronised = now + LOOK_EVERY, clock_synchronised()
+            if len(self._unspooled) < MAX_UNSPOOLED:
+                self._add_losses(now)
         for _ in range(TAKE):
             if len(self._unspooled) >= MAX_UNSPOOLED or self.writer.next_timer() <= now:
                 break
@@ -220,9 +202,6 @@ class Robot:
                 self._capture(raw, now)
             else:
                 break
-        if now - self._losses_at >= LOSSES_EVERY and len(self._unspooled) < MAX_UNSPOOLED:
-            self._losses_at = now
-            self._add_losses(now)
 
     def _capture(self, raw: RawMessage, now: float) -> None:
         self.box.look(raw)
@@ -233,9 +212,9 @@ class Robot:
             self._write(record, now)
 
     def _write(self, record: Record, now: float) -> None:
-        self.writer.add(record.line, now, record.definition, topic=record.topic)
+        self.writer.add(record.line, now, record.definition)
         if record.definition is not None:  # else it is no message
-            self.written[record.topic] += 1
+            self.captured += 1
 
     def _add_losses(self, now: float) -> None:
         for line in self.capture.loss_lines({**self._source_lost, **self.box.lost}):
@@ -250,14 +229,7 @@ class Robot:
         """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the queue."""
         self._unspooled.extend(chunks)
         self.chunks += len(chunks)
-        if chunks:
-            last = chunks[-1].header
-            self._marks.append((place_of(last), self.writer.sealed.copy()))
-            if len(self._marks) > MARKS:
-                self._marks = deque([*self._marks][::-2][::-1])
-        if "append" not in self._failing or now - self._spool_at >= SPOOL_AGAIN:
-            self._spool_at = now
-            self._spool_or(None, "append", self._append)
+        self._spool_or(None, "append", now, self._append)
 
     def _append(self) -> None:
         while self._unspooled:
@@ -265,10 +237,7 @@ class Robot:
             self._unspooled.popleft()
 
     def _send(self, now: float) -> None:
-        """What the spool cannot do is tried again, a second later."""
-        if now >= self._send_at:
-            self._spool_or(None, "send", partial(self.sender.send, now))
-            self._send_at = now + SPOOL_AGAIN if "send" in self._failing else now
+        self._spool_or(None, "send", now, lambda: self.sender.send(now))
 
     def _wait(self, now: float) -> float:
         due = LONGEST_WAIT if self._finished else self.writer.next_timer() - now
@@ -282,9 +251,7 @@ class Robot:
     def _last_words(self) -> None:
         """After `stop`: bring what is left to the server, if that takes no longer than a moment."""
         deadline = time.monotonic() + LAST_WORDS_TIME
-        while self.sender.connected and not self._spool_or(True, "idle", lambda: self.sender.idle):
-            if (now := time.monotonic()) >= deadline:
-                break
+        while self.sender.connected and not self._idle(True, now := time.monotonic()) and now < deadline:
             self._spool_chunks([], now)
             self._send(now)
             self.loop.step(0.02)
@@ -293,18 +260,23 @@ class Robot:
         """Take one event of the client."""
         self.sender.handle(event, time.monotonic())
 
-    def _spool_or(self, otherwise: _T, what: str, call: Callable[[], _T]) -> _T:
-        """What `call` gives, or `otherwise` where the spool does not do that; a full disk does not end a robot.
+    def _idle(self, otherwise: bool, now: float) -> bool:
+        return self._spool_or(otherwise, "idle", now, lambda: self.sender.idle)
+
+    def _spool_or(self, otherwise: _T, what: str, now: float, call: Callable[[], _T]) -> _T:
+        """What `call` gives, or `otherwise` where the spool does not do that; then it is retried SPOOL_AGAIN later.
 
         A spool may do one thing and not another: it works again when all that it did not do is done.
         """
+        if now < self._failing.get(what, ("", now))[1]:
+            return otherwise
         try:
             given = call()
         except StoreError as error:
-            self._failing[what], given = str(error), otherwise
+            self._failing[what], given = (str(error), now + SPOOL_AGAIN), otherwise
         else:
             self._failing.pop(what, None)
-        self.spool_trouble.now(next(iter(self._failing.values()), None))
+        self.spool_trouble.now(next((why for why, _ in self._failing.values()), None))
         return given
 
     def _summarise(self) -> str:
@@ -424,7 +396,7 @@ def open_robot(home: RobotHome, config: RobotConfig, password: bytes) -> Robot:
 
 
 def read_again(robot: Robot, home: RobotHome, running: RobotConfig) -> RobotConfig:
-    """Take up what changed in robot.toml and among the readers, without losing a message: topics, nodes, triggers,
+    """Reload robot.toml and the readers, without losing a message: topics, nodes, triggers,
     and readers; of a bag or a simulation, which was chosen from at the start, readers alone. What holds from now on.
 
     What cannot be used is told, and nothing changes.

@@ -7,7 +7,7 @@ disk.
 
 The log forked where the server's head is no chunk of this robot's and what follows here does not follow it: another
 machine has this robot's identity, or the disk was put back from an old copy. Then nothing is sent or removed, and it
-is told. Sans-IO but for the spool; `now` is seconds of a clock that does not jump.
+is told. `now` is seconds of a clock that does not jump.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def mend(failure: HandshakeFailed, channel: str) -> str:
         case Reason.EXPIRED:
             return (
                 "see to this machine's clock; if the certificates have expired, have the robot registered again, or the"
-                " server's made anew (`renew`)"
+                " server's made again (`renew`)"
             )
         case Reason.FULL:
             return "wait, or ask the operator for more `shards` (server.toml)"

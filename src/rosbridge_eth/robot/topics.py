@@ -183,7 +183,7 @@ def topics(
     home: RobotHomeOption = ROBOT_HOME, source: SourceOption = None,
     seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to listen.")] = 5.0, json: Json = False,
 ) -> None:  # fmt: skip
-    """List what there is to capture, and what it costs a day. With types, rates, sizes, and what robot.toml takes.
+    """List the topics and what they cost a day. With types, rates, sizes, and what robot.toml takes.
 
     Without a robot.toml, everything is taken but the topics of ROS itself, as `join --yes` chooses.
     """

@@ -165,6 +165,8 @@ class Rates:
 
 
 _STORED_RATES = Rates()
+_ADDRESSES: dict[str, str] = {}
+"""By robot, where its session was seen last."""
 
 
 # What each process shows
@@ -193,7 +195,11 @@ def of_worker(process: str, worker: Worker, wall: float) -> Iterator[Figure]:
     for session in reception.sessions.values():
         address = reception.server.address_of(session.connection)
         if address is not None:  # without its port, which is another each time
-            yield "session_seen_seconds", {"robot": session.peer.name, "address": address[0]}, wall
+            name, before = session.peer.name, _ADDRESSES.get(session.peer.name, "")
+            if before != address[0]:  # else a robot that moves without end would add figures without end
+                FIGURES.pop(("session_seen_seconds", (("robot", name), ("address", before))), None)
+            _ADDRESSES[name] = address[0]
+            yield "session_seen_seconds", {"robot": name, "address": address[0]}, wall
     for robot, at in reception.forked.items():
         yield "forked_seconds", {"robot": robot}, wall - time.monotonic() + at
     yield "condition", {"process": process, "name": "stores chunks"}, reception.trouble.why is None

@@ -32,9 +32,8 @@ from rosbridge_eth.server.shard import Secrets, name_of, open_store, run_shard
 log = logging.getLogger(__name__)
 
 WATCH = 0.2  # seconds between looks at the children
-GRACE = 10.0  # seconds for children to end in good order
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 30.0  # seconds before a shard that ended is started again
-LONG_LIFE = 60.0  # seconds after which a shard that ends is as one that ends for the first time
+GRACE = 10.0  # seconds for children to end
+PAUSE = 2.0  # seconds before a shard that ended is started again
 _FORK = multiprocessing.get_context("fork")
 
 
@@ -50,23 +49,16 @@ def notify(state: str) -> None:
 
 @dataclass(slots=True)
 class Child:
-    """A shard's process. due: when it is started, or started again; None while it runs. pause: seconds before that."""
+    """A shard's process. due: when it is started; None while it runs."""
 
     process: BaseProcess | None = None
     starts: int = 0
     since: float = 0.0
-    pause: float = 0.0
     due: float | None = float("-inf")
-
-    def ended(self, now: float) -> None:
-        """It ended: the pause grows, unless it lived long."""
-        longer = 0.0 if now - self.since > LONG_LIFE else 2 * self.pause
-        self.pause = min(LONGEST_PAUSE, max(FIRST_PAUSE, longer))
-        self.due = now + self.pause
 
 
 class Parent:
-    """Runs shards until `stop`, SIGTERM, SIGINT, or its terminal is gone. SIGHUP: all begin anew by server.toml."""
+    """Runs shards until `stop`, SIGTERM, SIGINT, or its terminal is gone. SIGHUP: all start again by server.toml."""
 
     def __init__(self, home: OperatorHome, secrets: Secrets, only: Sequence[int] = ()) -> None:
         """only: the shards that run here, where the others run elsewhere."""
@@ -140,7 +132,7 @@ class Parent:
         self._look(config, time.monotonic())
 
     def _reload(self, config: ServerConfig) -> ServerConfig:
-        """Begin anew by server.toml. What cannot be used is told, and nothing changes."""
+        """Begin again by server.toml. What cannot be used is told, and nothing changes."""
         try:
             new = self._checked()
         except BridgeError as error:
@@ -154,9 +146,9 @@ class Parent:
     def _look(self, config: ServerConfig, now: float) -> None:
         for shard, child in self._children.items():
             if child.due is None and child.process is not None and not child.process.is_alive():
-                child.ended(now)
+                child.due = now + PAUSE
                 log.error("%s ended with exit code %s after %.0f s; it is started again in %.0f s",
-                          name_of(shard), child.process.exitcode, now - child.since, child.pause)
+                          name_of(shard), child.process.exitcode, now - child.since, PAUSE)
             if child.due is not None and now >= child.due:
                 child.starts, child.since, child.due = child.starts + 1, now, None
                 task = (os.getpid(), child.starts, shard, config, self._home, self._secrets)
@@ -165,7 +157,7 @@ class Parent:
                 log.info("%s started, process %d", name_of(shard), child.process.pid)
 
     def _end(self) -> None:
-        """End the children in good order, and those that do not end within GRACE in any."""
+        """Ask the children to end; kill those that do not within GRACE."""
         running = [child.process for child in self._children.values() if child.process is not None]
         for process in running:
             process.terminate()

@@ -9,7 +9,7 @@ robot is told the head, and sends what follows it (log/hop.py).
     no room, the store is away, others'      `again`, and `why`: nothing more comes until that is over
     certificates, the log forked
 
-Sans-IO: drives a channel.Server and a Store. `now` is seconds of a clock that does not jump.
+Drives a channel.Server and a Store. `now` is seconds of a clock that does not jump.
 """
 
 from __future__ import annotations
@@ -266,7 +266,7 @@ class Worker:
         self.loop = make_loop(lambda event: reception.handle(event, time.monotonic()))
 
     def run(self, stopped: Callable[[], bool], *, on_turn: Callable[[], None] = lambda: None) -> None:
-        """Until `stopped()`; then every session is ended in good order. on_turn: called after every step."""
+        """Until `stopped()`; then every session is closed in order. on_turn: called after every step."""
         while not stopped():
             wait = self.reception.next_timer() - time.monotonic()
             self.loop.step(max(0.0, min(LONGEST_WAIT, wait)))

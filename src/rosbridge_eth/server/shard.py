@@ -90,7 +90,7 @@ def open_submitter(
 
     def account(tk: bytes) -> LocalAccount | None:
         found = registry.robots().get(tk)
-        return None if found is None else keys.robot(found.number)
+        return None if found is None else keys.account(found.number)
 
     return Submitter(
         ledger, store, lambda: robots_of(shard, config, registry), account, keys.operator if shard == 0 else None,

@@ -202,7 +202,7 @@ def test_a_backup_of_a_home_in_use_is_a_home(world: World, tmp_path: Path) -> No
     with registry_of(copy) as known:
         assert [*known.robots()] == [TK]
     assert load_ca(copy.ca, PASSPHRASE, NOW)
-    assert Keyring.load(copy.accounts, PASSPHRASE).robot(3).address == made.account
+    assert Keyring.load(copy.accounts, PASSPHRASE).account(3).address == made.account
     assert (copy.bundles / "robot_1.bundle").read_bytes() == made.bundle.read_bytes()
     assert copy.deployment() == world.home.deployment() and not (copy.path / "submitter.lock").exists()
     with pytest.raises(ConfigError, match="already"):
@@ -532,7 +532,7 @@ def test_an_old_backup_of_the_registry_does_not_stop_registrations(world: World,
     assert new.account not in accounts
     with registry(world) as known:
         found = known.find("robot", "robot_4")
-    assert found is not None and found.account == new.account == world.keys.robot(found.number).address
+    assert found is not None and found.account == new.account == world.keys.account(found.number).address
     with pytest.raises(IdentityError, match="robot_2"):
         world.register("robot_2")
 

@@ -254,7 +254,7 @@ def test_who_joins_is_told_the_readers_by_name(home: RobotHome, capsys: pytest.C
     other = ids.enrol(CA, Role.READER, "insurer", at=NOW).public.pem.decode()
     bundle = replace(answer(request), readers={"owner": READER.pem.decode(), "insurer": other}).signed(CA.key)
     _say_who(join(home, bundle))
-    assert "these may read what this robot writes: insurer, owner." in capsys.readouterr().err
+    assert "can open this robot's records: insurer, owner." in capsys.readouterr().err
 
 
 def test_a_robot_does_not_seal_for_a_reader_whose_certificates_have_ended(

@@ -110,9 +110,9 @@ class World:
         tail = self.store.find(TK, standing.tail)
         rows = self.store.rows(TK, tail or NOWHERE, limit)
         if rows:
-            number = next(n for n in range(1, 100) if self.keys.robot(n).address == standing.account)
+            number = next(n for n in range(1, 100) if self.keys.account(n).address == standing.account)
             chunks = self.store.chunks(TK, [row.place for row in rows])
-            self.ledger.set_data(self.keys.robot(number), TK, chunks)
+            self.ledger.set_data(self.keys.account(number), TK, chunks)
             if confirm:
                 self.store.set_state(TK, confirmed=rows[-1].place)
 

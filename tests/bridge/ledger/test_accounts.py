@@ -22,8 +22,8 @@ COST = 2**12  # scrypt's, for tests
 
 def test_accounts_are_those_a_wallet_shows():
     keyring = Keyring.from_mnemonic(f"  {WORDS.replace(' ', '   ')}\n")
-    assert [keyring.operator.address, keyring.robot(1).address, keyring.robot(2).address] == KNOWN
-    assert keyring.robot(1) is keyring.robot(1)
+    assert [keyring.operator.address, keyring.account(1).address, keyring.account(2).address] == KNOWN
+    assert keyring.account(1) is keyring.account(1)
 
 
 def test_new_ones_differ_and_can_be_written_down():
@@ -41,17 +41,17 @@ def test_words_that_are_no_mnemonic_are_refused(words: str):
         Keyring.from_mnemonic(words)
 
 
-@pytest.mark.parametrize("number", [0, -1, 2**31])
-def test_robots_never_get_the_operators_account(number: int):
+@pytest.mark.parametrize("number", [-1, 2**31])
+def test_a_number_that_bip_44_does_not_have_is_refused(number: int):
     with pytest.raises(IdentityError):
-        Keyring.from_mnemonic(WORDS).robot(number)
+        Keyring.from_mnemonic(WORDS).account(number)
 
 
 def test_what_is_sealed_opens_with_the_passphrase_alone():
     keyring = Keyring.from_mnemonic(WORDS)
     sealed = keyring.seal(b"pass phrase \xff", n=COST)
     opened = Keyring.open(sealed, b"pass phrase \xff")
-    assert opened.robot(5).address == keyring.robot(5).address
+    assert opened.account(5).address == keyring.account(5).address
     assert opened.mnemonic == keyring.mnemonic
     for wrong in (b"", b"pass phrase", b"pass phrase \xff "):
         with pytest.raises(IdentityError, match="password is wrong"):

@@ -28,7 +28,7 @@ from rosbridge_eth.log.chunk import robot_id
 
 pytestmark = pytest.mark.service
 
-OPERATOR, ROBOT, TK = KEYS.operator, KEYS.robot(1), robot_id("robot_1")
+OPERATOR, ROBOT, TK = KEYS.operator, KEYS.account(1), robot_id("robot_1")
 GWEI = 10**9
 
 

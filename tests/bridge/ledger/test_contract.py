@@ -21,7 +21,7 @@ from rosbridge_eth.ledger.nodes import EmbeddedChain
 from rosbridge_eth.ledger.transport import ChainUnavailable, OutOfFunds, Reverted, Underpriced
 from rosbridge_eth.log.chunk import robot_id
 
-OPERATOR, ROBOT, OTHER = KEYS.operator, KEYS.robot(1), KEYS.robot(2)
+OPERATOR, ROBOT, OTHER = KEYS.operator, KEYS.account(1), KEYS.account(2)
 TK, OTHER_TK = robot_id("robot_1"), robot_id("robot_2")
 NOBODY = "0x" + "00" * 20
 
@@ -164,7 +164,7 @@ def test_eth_goes_to_registered_robots_up_to_five():
 
 
 def test_a_robot_without_money_cannot_write(bare: Ledger):
-    poor = KEYS.robot(3)
+    poor = KEYS.account(3)
     bare.registration(OPERATOR, TK, poor.address, b"")
     with pytest.raises(OutOfFunds):  # a node; the contract's NoBalance is for what a node lets through
         bare.set_data(poor, TK, [b"a"])

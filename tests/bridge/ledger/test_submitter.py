@@ -16,7 +16,7 @@ from rosbridge_eth.ledger.transport import ChainUnavailable, Underpriced
 from rosbridge_eth.log.store import NO_HASH, NOWHERE, Outcome, place_of
 from rosbridge_eth.server.submitter import BATCH_BYTES, IN_FLIGHT, PATIENCE, Submitter
 
-ROBOT, OPERATOR = KEYS.robot(1).address, KEYS.operator.address
+ROBOT, OPERATOR = KEYS.account(1).address, KEYS.operator.address
 
 
 def waiting(world: World) -> list[int]:
@@ -495,7 +495,7 @@ def test_what_another_program_wrote_holds_only_its_robot_up(tmp_path: Path):
     world.run()
     standing = world.model.state.standings[world.pen.tk]
     raw = world.model.sign(
-        KEYS.robot(1), ("setData", world.pen.tk, 1, standing.tail, [b"?"]), nonce=1, gas=10**6, fees=Fees(10**10, 1)
+        KEYS.account(1), ("setData", world.pen.tk, 1, standing.tail, [b"?"]), nonce=1, gas=10**6, fees=Fees(10**10, 1)
     )
     world.model.send([raw.raw])
     world.model.mine()
@@ -516,7 +516,7 @@ def test_a_robot_that_may_not_write_is_on_hold_and_others_go_on(tmp_path: Path):
     standings = world.model.state.standings
     del standings[stranger.tk]
     standings[revoked.tk] = standings[revoked.tk]._replace(revoked=True)
-    standings[moved.tk] = standings[moved.tk]._replace(account=KEYS.robot(9).address)
+    standings[moved.tk] = standings[moved.tk]._replace(account=KEYS.account(9).address)
     for pen in world.pens:
         world.take(pen.chunks(2), pen)
     world.turn(mine=1)

@@ -27,7 +27,7 @@ class Pen:
     """A robot: one log, in streams. disk: the chunks that it was not told to be confirmed."""
 
     def __init__(self, name: str = "robot_1", number: int = 1) -> None:
-        self.tk, self.account = robot_id(name), KEYS.robot(number)
+        self.tk, self.account = robot_id(name), KEYS.account(number)
         self.log = Log(LEDGER_ID, self.tk)
         self.previous, self.stream, self.number, self.streams = bytes(32), bytes(15) + b"\x01", 0, 1
         self.written: list[Chunk] = []

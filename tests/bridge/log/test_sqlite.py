@@ -57,8 +57,19 @@ def test_the_inbox_of_another_contract_is_refused(path):
 
 @pytest.mark.parametrize("name", ["missing/store.sqlite", "."])
 def test_a_place_where_no_file_can_be_is_told(tmp_path, name):
-    with pytest.raises(StoreError, match="cannot be opened"):
+    with pytest.raises(StoreError, match=r"cannot be (opened|used)"):
         open_file(tmp_path / name)
+
+
+def test_another_process_that_opens_the_file_and_closes_it_leaves_the_log_of_two_connections_alone(path):
+    first, second = open_file(path), open_file(path)  # as a shard and its submitter have it
+    made = list(chain(2))
+    put(first, made[0])
+    look = "import sqlite3, sys; db = sqlite3.connect(sys.argv[1]); db.execute('SELECT * FROM robot'); db.close()"
+    subprocess.run([sys.executable, "-c", look, str(path)], check=True)
+    put(second, made[1])
+    assert path.with_name(path.name + "-wal").exists()
+    assert numbers(open_file(path, read_only=True)) == [0, 1]
 
 
 @pytest.mark.parametrize("version", [1, 3])

@@ -223,7 +223,7 @@ rate = 50
         return run(["trigger", "--home", str(robot.path), *more]), capsys.readouterr().err
 
     code, said = ask("near")
-    assert code == ExitCode.CONFIG and "no robot that has this trigger runs" in said
+    assert code == ExitCode.CONFIG and "no robot runs with the home" in said
     robot.event("near").touch()  # left by a command that was killed
     with running(robot, log) as process:
         eventually(lambda: len(fired(robot)) == 2, "it shows its figures")

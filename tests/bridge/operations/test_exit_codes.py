@@ -67,7 +67,7 @@ def written(
     """One chunk of the robot on the chain, for this reader or for one of whom nobody knows."""
     who, _ = load_identity(place.robot.identity, PASSWORD)
     [standing] = place.ledger.standings([TK])
-    account = next(keys.robot(number) for number in range(1, 9) if keys.robot(number).address == standing.account)
+    account = next(keys.account(number) for number in range(1, 9) if keys.account(number).address == standing.account)
     log = Log(place.operator.deployment().ledger, TK)
     made = chunk.seal(
         log, who.signing_key, lines, stream=STREAM, number=0,
@@ -90,7 +90,7 @@ def replayed(place: Place, keys: Keyring, without: int | None = None) -> None:
 def forged(place: Place, keys: Keyring) -> None:
     """A chunk in the robot's place, of which nobody can say who signed it."""
     [standing] = place.ledger.standings([TK])
-    account = next(keys.robot(number) for number in range(1, 9) if keys.robot(number).address == standing.account)
+    account = next(keys.account(number) for number in range(1, 9) if keys.account(number).address == standing.account)
     place.ledger.set_data(account, TK, [next(iter(chunk_chain(1))).encoded])
 
 

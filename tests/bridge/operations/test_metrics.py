@@ -7,6 +7,8 @@ import http.client
 import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -107,3 +109,18 @@ def test_how_fast_a_count_grows_is_what_it_grew_by_in_the_last_ten_looks():
     assert rates.of("a", 100, 0.0) == 0.0
     assert [rates.of("a", 100 + 5 * second, second) for second in range(1, 30)] == [5.0] * 29
     assert rates.of("a", 245, 30) == 4.5 and rates.of("b", 7, 30) == 0.0
+
+
+def test_a_robot_that_changes_its_address_without_end_has_one_figure(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(metrics, "FIGURES", {})
+    places = iter([("192.0.2.1", 1), ("192.0.2.1", 2), *((f"198.51.100.{number}", 1) for number in range(99))])
+    session = SimpleNamespace(peer=SimpleNamespace(name="roaming"), connection=b"c")
+    reception = SimpleNamespace(
+        server=SimpleNamespace(statistics=dict, address_of=lambda connection: next(places)), counts={}, records={},
+        forked={}, sessions={b"c": session}, trouble=SimpleNamespace(why=None),
+    )  # fmt: skip
+    worker: Any = SimpleNamespace(reception=reception, loop=SimpleNamespace(lost_sends=0))
+    for wall in range(101):
+        metrics.show(metrics.of_worker("shard-0", worker, float(wall)))
+    seen = [(labels, value) for name, labels, value in metrics.figures() if name == "session_seen_seconds"]
+    assert seen == [({"robot": "roaming", "address": "198.51.100.98"}, 100.0)]

@@ -19,11 +19,11 @@ from bridge.lone_robot import CA, NOW, READER, lone_robot
 from bridge.operations.conftest import PASSWORD, Place
 from rosbridge_eth.capture import process
 from rosbridge_eth.channel import ClientConfig, Connected, HandshakeFailed, Reason
-from rosbridge_eth.cli.robot import _picture
 from rosbridge_eth.config import Address, load_robot_config
 from rosbridge_eth.errors import ConfigError
 from rosbridge_eth.log.chunk import MAX_READERS
 from rosbridge_eth.operator.registry import Registry
+from rosbridge_eth.operator.status import robot_picture
 from rosbridge_eth.robot import loop as module
 from rosbridge_eth.robot.loop import Robot, open_robot, reader_keys
 from rosbridge_eth.robot.sources import sample_bag
@@ -68,15 +68,18 @@ def test_a_reason_is_said_with_its_mend_and_at_most_once_a_minute(place: Place, 
     assert all('channel = "exchange"' in line for line in said if "it is silent" in line)
 
 
-def test_the_picture_does_not_count_what_was_refused_among_what_waits_for_the_chain(place: Place) -> None:
+def test_a_running_robot_is_shown_at_its_terminal_by_its_own_figures(place: Place) -> None:
     robot = opened(place, NO_SERVER + ODOM + BAG)
     with closing(robot.spool), closing(robot.loop):
         for chunk in robot.writer.finish(0):
             robot.spool.append(chunk)
             robot.spool.set_aside(chunk.header.digest)
+        metrics.show(metrics.of_robot("robot_1", robot, 0.0))
         shown = Console(width=200, file=(out := io.StringIO()))
-        shown.print(_picture("robot_1", robot, metrics.Rates()))
-        assert "0 wait for the server, 0 for the chain, 0 confirmed" in out.getvalue()
+        shown.print(robot_picture("robot_1", "no session yet", metrics.figures()))
+        assert re.search("session +no session yet", out.getvalue())
+        assert re.search("spool chunks not stored +0", out.getvalue())
+        assert re.search("spool chunks set aside +1", out.getvalue())
 
 
 def test_a_disk_that_is_full_when_a_session_begins_does_not_end_a_robot(tmp_path: Path, caplog: Logged) -> None:
@@ -134,15 +137,15 @@ def test_a_server_whose_name_has_no_address_yet_does_not_keep_a_robot_from_captu
 
     monkeypatch.setattr(socket, "getaddrinfo", away)
     robot = opened(place, f'server = "robots.example:7410"\n{ODOM}{BAG}')
-    captured = len(list(robot.source.messages()))  # type: ignore[attr-defined]
+    captured, figures = len(list(robot.source.messages())), list[object]()  # type: ignore[attr-defined]
 
     def on_turn() -> None:
-        metrics.show(metrics.of_robot("robot_1", robot, 0.0))
+        figures[:] = metrics.of_robot("robot_1", robot, 0.0)
         if robot.captured == captured and robot.sender.refusal:
             robot.stop()
 
     robot.run(on_turn=on_turn)
-    assert metrics.CONDITION.labels("robot", "server's name has an address")._value.get() == 0
+    assert ("condition", {"process": "robot", "name": "server's name has an address"}, False) in figures
     [said] = warnings(caplog)
     why = "the address 'robots.example' cannot be found: Temporary failure in name resolution; see that this machine"
     assert why in said and why in robot.summary and f"{captured} records captured" in robot.summary

@@ -61,8 +61,8 @@ def on_chain(place: Place, monkeypatch: Patch) -> None:
 @pytest.fixture
 def write(place: Place, keys: Keyring) -> Callable[..., None]:
     """Have the chain take these chunks of robot_1, one batch."""
-    account = next(keys.robot(n) for n in range(1, 9)
-                   if keys.robot(n).address == place.ledger.standings([TK])[0].account)  # fmt: skip
+    account = next(keys.account(n) for n in range(1, 9)
+                   if keys.account(n).address == place.ledger.standings([TK])[0].account)  # fmt: skip
     return lambda *chunks: place.ledger.set_data(account, TK, [chunk.encoded for chunk in chunks]) and None
 
 

@@ -36,7 +36,7 @@ class Recorded:
 
     ledger: Ledger
     pen: Pen = field(default_factory=Pen)
-    account: Any = field(default_factory=lambda: KEYS.robot(1))
+    account: Any = field(default_factory=lambda: KEYS.account(1))
 
     def __post_init__(self) -> None:
         self.pen.log = Log(self.ledger.ledger, robot_id(NAME))
@@ -61,7 +61,7 @@ def at(seconds: float) -> int:
 
 def in_a_crowd(node: Anvil, recorded: Recorded, chunks: Sequence[Chunk], crowd: int) -> None:
     """A batch in one block behind so many transactions of somebody else."""
-    ledger, other, data = recorded.ledger, KEYS.robot(9), [chunk.encoded for chunk in chunks]
+    ledger, other, data = recorded.ledger, KEYS.account(9), [chunk.encoded for chunk in chunks]
     node.ask("evm_setAutomine", False)
     fees = ledger.fees(ledger.block())
     [(nonce, _)] = ledger.nonces([other.address])
@@ -81,7 +81,7 @@ def record(node: Anvil) -> Recorded:
     ledger, _ = Ledger.deploy(node.url, KEYS.operator)
     made = Recorded(ledger)
     other = enrol(authority(), Role.ROBOT, "robot_2", at=START)
-    ledger.registration(KEYS.operator, robot_id("robot_2"), KEYS.robot(5).address, other.public.certificates)
+    ledger.registration(KEYS.operator, robot_id("robot_2"), KEYS.account(5).address, other.public.certificates)
     for batch in range(3):
         first = batch * 40
         made.write(*(
@@ -89,10 +89,10 @@ def record(node: Anvil) -> Recorded:
                 *(odometry(n) for n in range(begin, begin + 20)), message(at(begin / 10), "/secret", text="not shown"),
             ) for begin in (first, first + 20)
         ))  # fmt: skip
-        ledger.set_data(KEYS.robot(5), robot_id("robot_2"), [f"another robot's {batch}".encode()])
+        ledger.set_data(KEYS.account(5), robot_id("robot_2"), [f"another robot's {batch}".encode()])
     in_a_crowd(node, made, [made.pen.write(*(odometry(n) for n in range(120, 140)))], 130)
     made.write(made.pen.write(message(at(14), "/evil", text=EVIL, big=2**62), odometry(140)))
-    account = KEYS.robot(2)
+    account = KEYS.account(2)
     ledger.replace_registration(KEYS.operator, made.pen.log.tk, account.address, robot(1).public.certificates)
     made.pen.identity, made.account = robot(1), account
     made.pen.new_stream(b"b" * 16)

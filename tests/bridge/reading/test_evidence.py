@@ -211,7 +211,7 @@ def ask_about(text: str, url: str, roots: Any = ROOTS) -> Asked:
 
 
 def test_on_a_network_with_proof_of_authority(tmp_path: Path, javascript):
-    rich = {key.address: 10**21 for key in (KEYS.operator, KEYS.robot(1))}
+    rich = {key.address: 10**21 for key in (KEYS.operator, KEYS.account(1))}
     try:
         chain = geth_network.Network(tmp_path, rich, nodes=1, period=1)
     except geth_network.Unavailable as reason:
@@ -434,7 +434,7 @@ def test_certificates_that_are_none_hide_none_that_follow(node: Anvil, javascrip
     """The contract takes whatever the operator registers: here the beginning of a certificate, of nothing."""
     made = Recorded(Ledger.deploy(node.url, KEYS.operator)[0])
     nothing = bytes.fromhex("3011" "300aa0030201020201013000" "3000" "030100") * 2
-    for account, certificates in ((KEYS.robot(3), nothing), (KEYS.robot(1), robot().public.certificates)):
+    for account, certificates in ((KEYS.account(3), nothing), (KEYS.account(1), robot().public.certificates)):
         made.ledger.replace_registration(KEYS.operator, made.pen.log.tk, account.address, certificates)
     made.write(made.pen.write(odometry(1)))
     text = made.evidence(Choice("/robot_1/odom")).encode()
@@ -453,10 +453,10 @@ def test_who_signs_with_the_key_of_a_certificate_that_is_replaced_is_told_by_the
     made.write(made.pen.write(odometry(1)))
     text = made.evidence(Choice("/robot_1/odom")).encode()
     made.ledger.replace_registration(
-        KEYS.operator, made.pen.log.tk, KEYS.robot(2).address, robot(1).public.certificates
+        KEYS.operator, made.pen.log.tk, KEYS.account(2).address, robot(1).public.certificates
     )
     assert ask_about(text, node.url).chunks == 1
-    made.account = KEYS.robot(2)
+    made.account = KEYS.account(2)
     made.write(made.pen.write(odometry(2)))  # under the old certificate still
     data = batch(made, 1)
     chunk = Chunk.parse(data.chunks[0])
@@ -576,7 +576,7 @@ def test_the_contract_is_asked_whether_it_has_it(span: str, recorded: Recorded, 
 
 
 def test_it_is_made_and_checked_with_nothing_that_a_node_may_lack():
-    chain = EmbeddedChain({KEYS.operator.address: 10**21, KEYS.robot(1).address: 10**18})
+    chain = EmbeddedChain({KEYS.operator.address: 10**21, KEYS.account(1).address: 10**18})
     made = Recorded(Ledger.deploy(chain, KEYS.operator)[0])
     made.write(made.pen.write(odometry(1)))
     assert len(check(made.evidence(Choice("/robot_1/odom")).encode()).records) == 1

@@ -21,7 +21,7 @@ from rosbridge_eth.log.chunk import Log
 from rosbridge_eth.reading import Bookmarks, Kind, Reading, read_robot
 
 KEYS = Keyring.from_mnemonic("test " * 11 + "junk")
-OPERATOR, ACCOUNT = KEYS.operator, KEYS.robot(1)
+OPERATOR, ACCOUNT = KEYS.operator, KEYS.account(1)
 ETH = 10**18
 NOW = START.timestamp() + 90_000
 
@@ -80,7 +80,7 @@ def test_nothing_is_written_yet(chain):
 
 def test_a_robot_that_is_replaced_and_revoked(chain):
     chain.write(chain.pen.chunks(2, goodbye=True))
-    other = KEYS.robot(2)
+    other = KEYS.account(2)
     tk = chain.pen.log.tk
     chain.ledger.replace_registration(OPERATOR, tk, other.address, robot(1).public.certificates)
     chain.ledger.alloc_eth(OPERATOR, other.address, ETH)
@@ -98,9 +98,9 @@ def test_a_robot_that_is_replaced_and_revoked(chain):
 def test_a_record_that_is_replayed_on_a_second_contract_is_refused(chain):
     chunks = chain.pen.chunks(2)
     second, _ = Ledger.deploy(chain.where, OPERATOR)
-    second.registration(OPERATOR, chain.pen.log.tk, KEYS.robot(3).address, robot().public.certificates)
-    second.alloc_eth(OPERATOR, KEYS.robot(3).address, ETH)
-    second.set_data(KEYS.robot(3), chain.pen.log.tk, [chunk.encoded for chunk in chunks])
+    second.registration(OPERATOR, chain.pen.log.tk, KEYS.account(3).address, robot().public.certificates)
+    second.alloc_eth(OPERATOR, KEYS.account(3).address, ETH)
+    second.set_data(KEYS.account(3), chain.pen.log.tk, [chunk.encoded for chunk in chunks])
     reading = chain.read(ledgers=[second])
     assert numbers(reading) == []
     assert violations(reading) == [Kind.FORGED.label]
@@ -175,7 +175,7 @@ class Dead(Node):
 
 
 CHANGED = [
-    {"account": KEYS.robot(5).address}, {"certificates_hash": b"x" * 32}, {"revoked": True}, {"chunks": 2},
+    {"account": KEYS.account(5).address}, {"certificates_hash": b"x" * 32}, {"revoked": True}, {"chunks": 2},
     {"chunks": 10**18}, {"tail": b"x" * 32}, {"data_block": 1}, {"account": None}, {"balance": 7},
 ]  # fmt: skip
 
@@ -230,7 +230,7 @@ def test_a_node_that_hides_a_revocation_is_told_beside_an_honest_one(chain):
 def test_a_replacement_in_the_middle_that_one_node_hides_is_told(chain):
     tk = chain.pen.log.tk
     for number in (1, 2):
-        chain.ledger.replace_registration(OPERATOR, tk, KEYS.robot(9).address, robot(number).public.certificates)
+        chain.ledger.replace_registration(OPERATOR, tk, KEYS.account(9).address, robot(number).public.certificates)
 
     class Hiding(Node):
         def registrations(self, tk: bytes, standing: Any) -> Any:

@@ -186,7 +186,7 @@ def test_a_bookmark_that_another_command_moved_is_not_moved_back(chain: Chain, t
 
 
 def test_several_robots_are_followed_and_the_trouble_of_one_is_its_own(chain: Chain, tmp_path: Path):
-    name, account = "robot_2", KEYS.robot(2)
+    name, account = "robot_2", KEYS.account(2)
     pen = Pen(identity=robot(2, name), log=Log(chain.ledger.ledger, robot_id(name)))
     chain.ledger.registration(OPERATOR, pen.log.tk, account.address, robot(2, name).public.certificates)
     chain.ledger.alloc_eth(OPERATOR, account.address, ETH)

@@ -76,7 +76,7 @@ class Written:
 
     def write(self, *chunks: Any) -> None:
         encoded = [chunk if isinstance(chunk, bytes) else chunk.encoded for chunk in chunks]
-        self.ledger.set_data(KEYS.robot(1), self.pen.log.tk, encoded)
+        self.ledger.set_data(KEYS.account(1), self.pen.log.tk, encoded)
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def chain(anvil: Anvil) -> Written:
     ledger, _ = Ledger.deploy(anvil.url, KEYS.operator)
     pen = Pen()
     pen.log = Log(ledger.ledger, pen.log.tk)
-    ledger.registration(KEYS.operator, pen.log.tk, KEYS.robot(1).address, robot().public.certificates)
+    ledger.registration(KEYS.operator, pen.log.tk, KEYS.account(1).address, robot().public.certificates)
     return Written(ledger, pen)
 
 
@@ -154,7 +154,7 @@ def test_several_readers_and_a_certificate_that_changes(chain, verifier, tmp_pat
     chain.write(*pen.chunks(2))
     pen.readers = [reader("insurer")]
     chain.write(*pen.chunks(1, goodbye=True))
-    account = KEYS.robot(2)
+    account = KEYS.account(2)
     chain.ledger.replace_registration(KEYS.operator, pen.log.tk, account.address, robot(1).public.certificates)
     pen.identity = robot(1)
     pen.new_stream(b"b" * 16)
@@ -189,7 +189,7 @@ def test_certificates_are_judged_by_the_table_of_the_page(chain, verifier, tmp_p
     """The same cases as evidence in test_evidence.py."""
     known = list(cases())
     for number, case in enumerate(known, 20):
-        account = KEYS.robot(number).address
+        account = KEYS.account(number).address
         chain.ledger.replace_registration(KEYS.operator, chain.pen.log.tk, account, case.registered)
     read = both(chain, verifier, tmp_path, cas=CAS)
     judged = dict(zip((case.name for case in known), read.here.certificates[1:], strict=True))

@@ -31,7 +31,7 @@ MAX_WAIT_NS = 3600 * 10**9
 
 
 class BagSource(Source):
-    """What of a bag is replayed, and how fast; it can be run again and then starts anew.
+    """What of a bag is replayed, and how fast; it can be run again and then starts again.
 
     speed: 1.0 is the recorded pace; None is as fast as messages are taken.
     """

@@ -38,7 +38,7 @@ class LiveSource(Source):
             log.warning("%s", text)
 
     def _well_again(self, key: str) -> None:
-        """What was said under this key is over; it is said anew the next time."""
+        """What was said under this key is over; it is said again the next time."""
         if key in self._said:
             self._said.discard(key)
             log.info("%s: in order again", key)

@@ -130,13 +130,9 @@ class Selection:
         missing = [name for name in self.unmatched(offers) if name in exact or not chosen]
         if not missing and chosen:
             return chosen
-        nodes = sorted({node for offer in offers for node in offer.nodes})
-        near = difflib.get_close_matches(missing[0], [*(offer.topic for offer in offers), *nodes], 1) if missing else []
+        names = [*(offer.topic for offer in offers), *(node for offer in offers for node in offer.nodes)]
+        near = difflib.get_close_matches(missing[0], names, 1) if missing else []
         hint = f"did you mean {near[0]}? It" if near else "it"
+        nodes = " and does not say which nodes published" if self.names_nodes and len(names) == len(offers) else ""
         topics = ", ".join(map(str, offers[:20])) or "no topics"
-        more = f" and {len(offers) - 20} more" if len(offers) > 20 else ""
-        raise SourceError(
-            f"{where} has no topic or node {', '.join(missing)};"
-            f" {hint} has {topics}{more}" + (f", published by {', '.join(nodes[:20])}" if nodes else "")
-            + ("" if nodes or not self.names_nodes else "; it does not say which nodes published: name topics")
-        )  # fmt: skip
+        raise SourceError(f"{where} has no topic or node {', '.join(missing)}; {hint} has {topics}{nodes}")

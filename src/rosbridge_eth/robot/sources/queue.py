@@ -31,7 +31,8 @@ class Queue:
 
     def __init__(self, size: int, *, waits: bool) -> None:
         self._size, self._waits = size, waits
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
         self._messages: deque[RawMessage] = deque()
         self._bytes = Counter[str]()  # of each topic
         self._total = 0
@@ -44,7 +45,7 @@ class Queue:
     def put(self, message: RawMessage) -> bool:
         """Keep the message. Whether there was none before it."""
         topic, size = message.topic, len(message.raw) + OVERHEAD
-        with self._changed:
+        with self._lock:
             while self._waits and not self._closed and self._messages and self._total + size > self._size:
                 self._changed.wait()
             if self._closed:
@@ -65,7 +66,7 @@ class Queue:
 
     def take(self) -> RawMessage | None:
         """The oldest message; None where there is none. Does not wait."""
-        with self._changed:
+        with self._lock:
             if not self._messages:
                 return None
             if self._waits and self._total <= self._size // 2:  # not at each message: waking a thread costs more
@@ -76,7 +77,7 @@ class Queue:
 
     def close(self) -> None:
         """Keep nothing more, and let nobody wait; what is there can still be taken."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             self._changed.notify_all()
 

@@ -1,15 +1,15 @@
 """A simulated robot for a machine without one: nav_msgs/Odometry and sensor_msgs/Imu, as ROS 1 writes them.
 
-A differential-drive robot on a figure eight. The motion is a pure function of
-the seed and the tick (`drive`); `SimSource` gives it a pace.
+It drives a figure eight at a constant speed. The motion is a function of the time alone (`drive`); `SimSource` gives it
+a pace.
 """
 
 from __future__ import annotations
 
 import math
-import random
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import count
 from typing import Any, NamedTuple
 
 from rosbridge_eth.capture import Decoder, RawMessage, Restoration, Wire, decoder_for_known
@@ -19,9 +19,6 @@ SPEED = 0.5
 """Metres per second along the path."""
 RADIUS = 1.0
 """Metres; of each of the two circles."""
-SPEED_NOISE = 0.01
-TURN_NOISE = 0.01
-"""Standard deviations, m/s and rad/s: how badly the wheels follow the command."""
 GRAVITY = 9.80665
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -29,35 +26,20 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 class Motion(NamedTuple):
-    """Where the robot is and how it moves: metres, radians, seconds; heading in (-pi, pi]."""
+    """Where the robot is and how it turns: metres, radians in (-pi, pi], radians a second."""
 
-    x: float = 0.0
-    y: float = 0.0
-    heading: float = 0.0
-    speed: float = 0.0
-    turn: float = 0.0
-
-
-def advance(motion: Motion, speed: float, turn: float, dt: float) -> Motion:
-    """Drive for `dt` along an arc, at a constant speed and turn rate, which is not 0."""
-    heading = motion.heading + turn * dt
-    x = motion.x + speed / turn * (math.sin(heading) - math.sin(motion.heading))
-    y = motion.y - speed / turn * (math.cos(heading) - math.cos(motion.heading))
-    return Motion(x, y, math.remainder(heading, math.tau), speed, turn)
+    x: float
+    y: float
+    heading: float
+    turn: float
 
 
-def drive(seed: int, rate: float) -> Iterator[Motion]:
-    """The motion at each tick of 1/rate seconds, endlessly; the same for the same arguments."""
-    noise = random.Random(seed)  # noqa: S311 - simulated wheel slip, nothing secret
-    lap = math.tau * RADIUS / SPEED
-    motion, tick = Motion(), 0
-    while True:
-        yield motion
-        left = int(tick / rate / lap) % 2 == 0
-        speed = SPEED + noise.gauss(0, SPEED_NOISE)
-        turn = (SPEED / RADIUS if left else -SPEED / RADIUS) + noise.gauss(0, TURN_NOISE)
-        motion = advance(motion, speed, turn, 1 / rate)
-        tick += 1
+def drive(seconds: float) -> Motion:
+    """Where it is after so long: a circle to the left, one to the right, and again."""
+    laps, lap = divmod(seconds * SPEED / (math.tau * RADIUS), 1)
+    side, angle = (1, -1)[int(laps) % 2], lap * math.tau
+    x, y = RADIUS * math.sin(angle), side * RADIUS * (1 - math.cos(angle))
+    return Motion(x, y, math.remainder(side * angle, math.tau), side * SPEED / RADIUS)
 
 
 class SimSource(Source):
@@ -71,11 +53,11 @@ class SimSource(Source):
 
     def __init__(
         self, selection: Selection, clock: Clock | None = None, *,
-        robot: str = "robot_1", seed: int = 1, rate: float = 10.0, duration: int | None = None,
+        robot: str = "robot_1", rate: float = 10.0, duration: int | None = None,
         speed: float | None = 1.0,
     ) -> None:  # fmt: skip
         """Raises SourceError if the selection names what the robot does not have."""
-        self._robot, self._seed, self._rate, self._duration, self._speed = robot, seed, rate, duration, speed
+        self._robot, self._rate, self._duration, self._speed = robot, rate, duration, speed
         self._clock = clock or Clock()
         nodes = (f"/{robot}/sim",)
         self._offers = (Offer(f"/{robot}/imu", IMU, nodes), Offer(f"/{robot}/odom", ODOMETRY, nodes))
@@ -93,12 +75,12 @@ class SimSource(Source):
 
     def messages(self, start_ns: int) -> Iterator[RawMessage]:
         """The watched messages from a start time on, without waiting."""
-        for tick, motion in enumerate(drive(self._seed, self._rate)):
+        for tick in count():
             passed = round(tick * 1e9 / self._rate)
             if self._duration is not None and passed >= self._duration:
                 return
             for offer, restoration in self._watched:
-                data = _CONTENT[offer.type_name](self._robot, tick, start_ns + passed, motion)
+                data = _CONTENT[offer.type_name](self._robot, tick, start_ns + passed, drive(passed / 1e9))
                 raw = restoration.decoder.encode(restoration.restore(data).message)
                 yield RawMessage(offer.topic, offer.type_name, start_ns + passed, raw, restoration.decoder)
 
@@ -121,7 +103,7 @@ def _odometry(robot: str, tick: int, stamp_ns: int, motion: Motion) -> dict[str,
         "header": {"seq": tick, "stamp": stamp_ns, "frame_id": f"{robot}/odom"},
         "child_frame_id": f"{robot}/base_link",
         "pose": {"pose": {"position": position, "orientation": _orientation(motion)}},
-        "twist": {"twist": {"linear": {"x": motion.speed}, "angular": {"z": motion.turn}}},
+        "twist": {"twist": {"linear": {"x": SPEED}, "angular": {"z": motion.turn}}},
     }
 
 
@@ -131,7 +113,7 @@ def _imu(robot: str, tick: int, stamp_ns: int, motion: Motion) -> dict[str, Any]
         "orientation": _orientation(motion),
         "angular_velocity": {"z": motion.turn},
         # Centripetal, and the table that holds it up.
-        "linear_acceleration": {"y": motion.speed * motion.turn, "z": GRAVITY},
+        "linear_acceleration": {"y": SPEED * motion.turn, "z": GRAVITY},
     }
 
 

@@ -16,7 +16,7 @@ from bridge.sources.ros1.graph import SYSTEM_PYTHON
 from rosbridge_eth.capture import DefinitionError, Wire, decoder_for
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources.ros1.api import Refusal
-from rosbridge_eth.robot.sources.ros1.tcpros import read_header, read_publication, request_header
+from rosbridge_eth.robot.sources.ros1.tcpros import read_decoder, read_header, request_header
 
 STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "message_definition": "string data"}
 
@@ -34,8 +34,8 @@ def types(require):
 def test_every_type_that_debian_ships_has_the_sum_that_genpy_gives_it(types):
     assert len(types) > 100
     for name, text, md5 in types:
-        publication = read_publication({"type": name, "md5sum": md5, "message_definition": text})
-        assert publication.type_name == name.replace("/", "/msg/")
+        decoder = read_decoder({"type": name, "md5sum": md5, "message_definition": text})
+        assert decoder.type_name == name.replace("/", "/msg/")
 
 
 @pytest.mark.service
@@ -43,8 +43,8 @@ def test_a_type_of_noetic_needs_no_definition(types):
     for name, text, md5 in types:
         if not name.startswith(("std_msgs/", "nav_msgs/")):
             continue
-        publication = read_publication({"type": name, "md5sum": md5, "message_definition": ""})
-        assert publication.decoder.fields == decoder_for(Wire.ROS1, name, text).fields
+        decoder = read_decoder({"type": name, "md5sum": md5, "message_definition": ""})
+        assert decoder.fields == decoder_for(Wire.ROS1, name, text).fields
 
 
 # The wiki's own example of constants, and spaces where people put them; the sums are genpy's (generate_dynamic).
@@ -62,18 +62,18 @@ def test_constants_spaces_and_comments_count_as_genpy_counts_them(require):
     assert decoder_for(Wire.ROS1, "a/B", TRICKY).definition.md5 == run.stdout.strip()
 
 
-def test_what_a_header_says_is_kept():
-    publication = read_publication({**STRING, "callerid": "/talker", "latching": "1", "topic": "/t"})
-    assert (publication.type_name, publication.node) == ("std_msgs/msg/String", "/talker")
+def test_other_fields_of_a_header_do_not_matter():
+    decoder = read_decoder({**STRING, "callerid": "/talker", "latching": "1", "topic": "/t"})
+    assert decoder.type_name == "std_msgs/msg/String"
 
 
 def test_the_reasons_of_a_refusal_are_told():
     with pytest.raises(Refusal, match="the publisher refuses: go away"):
-        read_publication({"error": "go away"})
+        read_decoder({"error": "go away"})
     with pytest.raises(DefinitionError, match=r"has the md5 sum 992c.*, not '0000"):
-        read_publication({**STRING, "md5sum": "0" * 32})
+        read_decoder({**STRING, "md5sum": "0" * 32})
     with pytest.raises(DefinitionError, match="does not define a/msg/B"):
-        read_publication({**STRING, "type": "a/B", "message_definition": ""})
+        read_decoder({**STRING, "type": "a/B", "message_definition": ""})
 
 
 def test_a_subscriber_asks_for_any_type():
@@ -86,9 +86,9 @@ def test_a_subscriber_asks_for_any_type():
                     st.text(max_size=60)),
     st.booleans(),
 )  # fmt: skip
-def test_any_header_is_a_publication_or_refused(fields, complete):
+def test_any_header_is_a_decoder_or_refused(fields, complete):
     with contextlib.suppress(SourceError):
-        read_publication({**STRING, **fields} if complete else fields)
+        read_decoder({**STRING, **fields} if complete else fields)
 
 
 LINES = st.one_of(

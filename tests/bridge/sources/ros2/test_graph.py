@@ -160,7 +160,7 @@ def test_publishers_of_one_topic_may_differ_and_change(ros: Graph):
     watcher = ros.watcher('topics = ["/t"]')
     watcher.recorded(1)
     second.order(create="/t", type=STRING, reliable=False)
-    watcher.says("watched anew")
+    watcher.says("watched again")
     for node in (first, second):
         node.order(**{"await": "/t"})
     second.order(publish="/t", fields={"data": "second"})

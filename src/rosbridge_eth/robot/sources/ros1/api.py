@@ -46,7 +46,7 @@ class ProtocolError(SourceError):
 
 
 class Refusal(SourceError):
-    """The peer answered in good order that it will not do what was asked, or cannot be recorded as it is."""
+    """The peer answered correctly that it will not do what was asked, or cannot be recorded as it is."""
 
 
 FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError, OverflowError)
@@ -55,15 +55,9 @@ FAILURES: Final = (SourceError, OSError, EOFError, UnicodeError, OverflowError)
 
 def why(error: BaseException) -> str:
     """The reason of a failed connection in words."""
-    if isinstance(error, socket.gaierror | UnicodeError):
-        return "its name does not resolve"
-    if isinstance(error, ConnectionRefusedError):
-        return "the connection was refused"
-    if isinstance(error, ConnectionError | EOFError):
-        return "the connection was closed"
-    if isinstance(error, TimeoutError):
-        return "it does not answer in time"
-    return (error.strerror or "the connection failed").lower() if isinstance(error, OSError) else str(error)
+    if isinstance(error, OSError):
+        return error.strerror or str(error) or "the connection failed"
+    return str(error) or "the connection was closed"
 
 
 # Addresses and names

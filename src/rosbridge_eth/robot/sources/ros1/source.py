@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, Final, TypeVar
 
-from rosbridge_eth.capture import RawMessage
+from rosbridge_eth.capture import Decoder, RawMessage
 from rosbridge_eth.config import Address
 from rosbridge_eth.errors import SourceError
 from rosbridge_eth.robot.sources.live import LiveSource
@@ -191,10 +191,9 @@ class Ros1Source(LiveSource):
 
     # What the publishers' threads tell
 
-    def received(self, topic: str, publication: tcpros.Publication, body: bytes) -> None:
+    def received(self, topic: str, decoder: Decoder, body: bytes) -> None:
         """A message is complete."""
-        received_ns = self._clock.wall_ns()
-        self._emit(RawMessage(topic, publication.type_name, received_ns, body, publication.decoder))
+        self._emit(RawMessage(topic, decoder.type_name, self._clock.wall_ns(), body, decoder))
 
     def passed_over(self, topic: str, length: int) -> None:
         """A message is not read."""
@@ -208,7 +207,7 @@ class Ros1Source(LiveSource):
         if publisher.over.is_set():
             return
         publisher.over.set()
-        publisher.topic.nodes = None  # it may have started anew somewhere else
+        publisher.topic.nodes = None  # it may have started again somewhere else
         text = f"{publisher.name}: the publisher at {publisher.uri[:200]}: {api.why(error)}"
         if publisher.connected and not isinstance(error, SourceError):
             log.info("%s", text)
@@ -253,15 +252,15 @@ class Publisher(threading.Thread):
                 return
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a machine may go without a word
             sock.sendall(tcpros.request_header(self.name, node.caller_id))
-            publication = tcpros.read_publication(tcpros.read_header(stream))
+            decoder = tcpros.read_decoder(tcpros.read_header(stream))
             self.connected = True
-            log.info("%s: reading %s from %s", self.name, publication.type_name, publication.node or self.uri)
+            log.info("%s: reading %s from %s", self.name, decoder.type_name, self.uri)
             while True:
                 sock.settimeout(None)  # between messages, silence is no fault
                 length = tcpros.read_length(stream)
                 sock.settimeout(STALLED)
                 if length <= node.max_message:
-                    node.received(self.name, publication, tcpros.read_exactly(stream, length))
+                    node.received(self.name, decoder, tcpros.read_exactly(stream, length))
                 else:
                     node.passed_over(self.name, length)
                     tcpros.pass_over(stream, length)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from typing import BinaryIO, Final, NamedTuple
+from typing import BinaryIO, Final
 
 from rosbridge_eth.capture import Decoder, DefinitionError, Wire, decoder_for, decoder_for_known, normalised_type_name
 from rosbridge_eth.robot.sources.ros1.api import ProtocolError, Refusal
@@ -25,14 +25,6 @@ ANY: Final = "*"
 
 _LENGTH = struct.Struct("<I")
 _PIECE: Final = 1 << 16
-
-
-class Publication(NamedTuple):
-    """What comes over one connection."""
-
-    type_name: str
-    decoder: Decoder
-    node: str
 
 
 def request_header(topic: str, node: str) -> bytes:
@@ -86,7 +78,7 @@ def pass_over(stream: BinaryIO, length: int) -> None:
         length -= len(read_exactly(stream, min(length, _PIECE)))
 
 
-def read_publication(fields: Mapping[str, str]) -> Publication:
+def read_decoder(fields: Mapping[str, str]) -> Decoder:
     """Judge the answer to our header. Raises Refusal, ProtocolError or DefinitionError."""
     if "error" in fields:
         raise Refusal(f"the publisher refuses: {fields['error'][:200]}")
@@ -100,4 +92,4 @@ def read_publication(fields: Mapping[str, str]) -> Publication:
         raise DefinitionError(f"the publisher does not define {name}, and ROS Noetic does not ship it")
     if decoder.definition.md5 != md5:
         raise DefinitionError(f"the definition of {name} has the md5 sum {decoder.definition.md5}, not {md5[:60]!r}")
-    return Publication(name, decoder, fields.get("callerid", "")[:256])
+    return decoder

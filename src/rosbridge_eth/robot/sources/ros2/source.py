@@ -130,7 +130,12 @@ class Ros2Source(LiveSource):
         self._look_now = False
         offers = [*self._read_graph(only_wanted=True), *(topic.offer for topic in self._topics.values())]
         for text in self._selection.unmatched(offers) if tell else ():
-            self._tell_unmatched(text)
+            found = ", ".join(map(str, self._read_graph()[:20])) or "no topics"
+            self._say(
+                f"unmatched {text}",
+                f"nothing publishes {text} yet; domain {self._context.get_domain_id()} has {found}. Check ROS_DOMAIN_ID"
+                " and ROS_AUTOMATIC_DISCOVERY_RANGE",
+            )
         wanted = {(offer.topic, offer.type_name): offer for offer in self._selection.resolve(offers)}
         for key in self._topics.keys() - wanted.keys():
             self._node.destroy_subscription(self._topics.pop(key).subscription)
@@ -141,7 +146,7 @@ class Ros2Source(LiveSource):
             if topic.refused:
                 self._node.destroy_subscription(topic.subscription)
                 topic.subscription, topic.refused = self._subscribe(topic), False
-                log.info("%s: publishers changed, watched anew", topic.offer.topic)
+                log.info("%s: publishers changed, watched again", topic.offer.topic)
 
     def _read_graph(self, only_wanted: bool = False) -> list[Offer]:
         """What is offered. only_wanted: leave out what no name or pattern of a topic means."""
@@ -205,7 +210,12 @@ class Ros2Source(LiveSource):
         }
         for each in found:
             if topic.publishers[bytes(each.endpoint_gid)]:
-                self._tell_foreign(topic.offer, each)
+                self._say(
+                    f"foreign {name} {parts.type_hash_of(each)}",
+                    f"{name}: {parts.name_of(each) or 'somebody'} publishes with another definition of {kind} than is"
+                    " installed here; its messages are left out and counted. Build both from the same version of"
+                    f" package {kind.partition('/')[0]}",
+                )
         topic.last = {publisher: number for publisher, number in topic.last.items() if publisher in topic.publishers}
 
     def _callback(self, topic: _Topic) -> Callable[[bytes, Any], None]:
@@ -236,29 +246,11 @@ class Ros2Source(LiveSource):
                 return  # received before the subscription was made again
             topic.last[publisher] = number
             if number > last + 1:
-                self._tell_lost(name, number - last - 1)
+                self._losses[name, "lost"] += (count := number - last - 1)
+                self._say(
+                    f"lost {name}",
+                    f"{name}: messages were lost on their way here ({count} now, then counted); its publisher is best"
+                    " effort, or a larger depth in [source] helps",
+                )
         received_ns = info.get("received_timestamp") or self._clock.wall_ns()
         self._emit(RawMessage(name, topic.offer.type_name, received_ns, raw, topic.decoder))
-
-    # What a person is told, once
-
-    def _tell_lost(self, name: str, count: int) -> None:
-        self._losses[name, "lost"] += count
-        why = "its publisher is best effort, or a larger depth in [source] helps"
-        self._say(f"lost {name}", f"{name}: messages were lost on their way here ({count} now, then counted); {why}")
-
-    def _tell_foreign(self, offer: Offer, endpoint: Any) -> None:
-        self._say(
-            f"foreign {offer.topic} {parts.type_hash_of(endpoint)}",
-            f"{offer.topic}: {parts.name_of(endpoint) or 'somebody'} publishes with another definition of "
-            f"{offer.type_name} than is installed here; its messages are left out and counted. Build both from the "
-            f"same version of package {offer.type_name.partition('/')[0]}",
-        )
-
-    def _tell_unmatched(self, text: str) -> None:
-        topics = ", ".join(map(str, self._read_graph()[:20])) or "no topics"
-        self._say(
-            f"unmatched {text}",
-            f"nothing publishes {text} yet; domain {self._context.get_domain_id()} has {topics}. Check ROS_DOMAIN_ID"
-            " and ROS_AUTOMATIC_DISCOVERY_RANGE",
-        )
