@@ -18,7 +18,7 @@ def test_the_page_works_from_its_first_command_to_its_last(require: Callable[[st
     require("openssl")
     bash = require("bash")
     blocks = re.findall(r"^```(sh|python)\n(.*?)^```$", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 11
+    assert len(blocks) == 10
     environment = os.environ | {
         "PYTHONPATH": str(Path(smcrypto.__file__).parents[1]),
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",

@@ -1,8 +1,8 @@
 """`doctor`: tries everything that a home depends on, for real, and names the fix for what does not work.
 
 A check is a function that yields findings. What a running home shows comes from `status`; the checks here try the rest:
-keys, certificates, ports, the source, a session. Nothing is changed or made, and a port or session that was tried is
-given back.
+keys, certificates, disk, ports, a session (`topics` tries the source). Nothing is changed or made,
+and a port or session that was tried is given back.
 """
 
 from __future__ import annotations
@@ -171,10 +171,11 @@ def operations(home: OperatorHome, secret: bytes | None) -> Findings:
     found = [*state(report)]
     yield from found
     waits = sum(robot.get("waiting", {}).get("chunks", 0) for robot in report["robots"].values())
-    works = {
-        "registry": f"{sum(each['revoked'] is None for each in report['names'])} names in force",
-        "store": f"{waits} chunks wait", "treasury": f"{report['operator']['eth'] or 0:.4f} ETH",
-    }  # fmt: skip
+    works = {"registry": f"{sum(each['revoked'] is None for each in report['names'])} names in force"}
+    if report["contract"]:
+        works["store"] = f"{waits} chunks wait"
+    if (eth := report["operator"]["eth"]) is not None:
+        works["treasury"] = f"{eth:.4f} ETH"
     yield from (ok(what, said) for what, said in works.items() if what not in {each.what for each in found})
     if node := report["node"]:
         yield from node_found(node["url"], node["block"], node["age_seconds"])

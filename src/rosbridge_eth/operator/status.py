@@ -221,13 +221,13 @@ def _add_alarms(report: Report) -> None:
             report["alarms"].append((name, FORKED))
         if (oldest := robot.get("waiting", {}).get("oldest") or 0) > TOO_OLD:
             report["alarms"].append((name, f"a chunk has waited {span(oldest)} to be confirmed"))
-    report["alarms"] += [
-        (each["robot"], f"dead letters, {counted(each['chunks'], 'chunk')}: {each['why']}") for each in report["dead"]
-    ]
 
 
 def _alarms(report: Report) -> list[str]:
-    return [f"ALARM: {what}: {said}" for what, said in report["alarms"]]
+    """As they are shown: dead letters, too, for which `doctor` knows no fix."""
+    dead = [(each["robot"], f"dead letters, {counted(each['chunks'], 'chunk')}: {each['why']}")
+            for each in report.get("dead", ())]  # fmt: skip
+    return [f"ALARM: {what}: {said}" for what, said in [*report["alarms"], *dead]]
 
 
 def of_robot(place: RobotHome) -> Report:
