@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy
-from pydantic import BaseModel, Field, StringConstraints
+from pydantic import BaseModel, Field, StringConstraints, ValidationError
 
 from rosbridge_eth.capture import TypeLine
 from rosbridge_eth.config.values import counted, duration_text, time_text
@@ -215,8 +215,9 @@ class Bookmarks:
         except FileNotFoundError:
             return {}
         except (ValueError, OSError) as error:
+            why = error.errors(include_url=False)[0]["msg"] if isinstance(error, ValidationError) else error
             raise ConfigError(
-                f"the bookmarks in {self._path} cannot be used ({shown(str(error))}); bring the file back from a copy:"
+                f"the bookmarks in {self._path} cannot be used ({shown(str(why))}); bring the file back from a copy:"
                 " without it a reading cannot know whether the log is the one that was read before"
             ) from error
 
