@@ -343,3 +343,32 @@ def test_a_live_source_that_dies_ends_the_robot_at_once_though_no_server_is_ther
         robot.run(on_turn=lambda: robot.stop() if next(turns) == 99 else None)
     assert next(turns) < 99 and "the graph was lost" in caplog.text
     assert time.monotonic() - began < 60 and robot.source.closed  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("marks", [512, 4])
+def test_what_is_confirmed_of_a_topic_is_what_chunks_up_to_that_place_hold(
+    make: Callable[[int], Robot], monkeypatch: pytest.MonkeyPatch, marks: int
+) -> None:
+    monkeypatch.setattr("rosbridge_eth.robot.loop.MARKS", marks)
+    monkeypatch.setattr("rosbridge_eth.robot.loop.GATHER", 0.0)
+    robot = make(300)
+    emit = robot._emit
+
+    def slowly(raw: RawMessage) -> None:  # so that there are several chunks
+        time.sleep(0.001)
+        emit(raw)
+
+    monkeypatch.setattr(robot, "_emit", slowly)
+    monkeypatch.setattr(robot.spool, "close", lambda: None)
+    robot.run(on_turn=lambda: robot.stop() if robot.captured == 300 else None)
+    chunks = [Chunk.parse(robot.spool.chunks([row.place])[0]) for row in robot.spool.rows(NOWHERE, 10_000)]
+    assert robot.writer.sealed[TOPIC] == robot.written[TOPIC] == 300 and len(chunks) > 20
+    lines, shown = -2, []  # the line that opens the stream, and that of the type
+    for chunk in chunks:
+        lines += chunk.header.records
+        robot.sender.newest = place_of(chunk.header)
+        assert robot.confirmed()[TOPIC] <= max(0, lines)
+        shown.append(robot.confirmed()[TOPIC] == max(0, lines))
+    assert shown[-1] and robot.confirmed()[TOPIC] == 300 and len(robot._marks) == 0
+    assert all(shown) == (marks == 512)
+    Spool.close(robot.spool)

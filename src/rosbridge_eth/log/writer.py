@@ -15,7 +15,7 @@ that does not jump, `wall_ms` milliseconds since 1970.
 from __future__ import annotations
 
 import secrets
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 
 from rosbridge_eth.log import chunk
@@ -46,8 +46,10 @@ class LogWriter:
         self._period, self._heartbeat, self._compress = period, heartbeat, compress
         self._randomness, self._secret = randomness, chunk.content_secret(key)
         self._now = self._last_chunk = now
-        self._waiting: deque[tuple[float, bytes, tuple[str, bytes] | None]] = deque()  # as `add` was given them
+        self._waiting: deque[tuple[float, bytes, tuple[str, bytes] | None, str]] = deque()  # as `add` was given them
         self._bytes = 0
+        self.sealed = Counter[str]()
+        """Lines that are in chunks, by the topic that `add` was told."""
         self.stream = b""
         """The newest stream of which a chunk was sealed; empty before the first."""
         self.newest = newest
@@ -69,7 +71,7 @@ class LogWriter:
             self._readers = tuple(readers)
             self._defined.clear()
 
-    def add(self, line: bytes, now: float, definition: tuple[str, bytes] | None = None) -> None:
+    def add(self, line: bytes, now: float, definition: tuple[str, bytes] | None = None, *, topic: str = "") -> None:
         """Take one line in. Call `closed` afterwards, or when `next_timer` says.
 
         definition: a type, and the line that defines it, which goes before this one unless the stream has said it
@@ -79,7 +81,7 @@ class LogWriter:
         if definition is not None:
             _check(definition[1])
         self._now = now
-        self._waiting.append((now, line, definition))
+        self._waiting.append((now, line, definition, topic))
         self._bytes += len(line)
 
     def wrote(self, sealed: Chunk) -> bool:
@@ -119,7 +121,7 @@ class LogWriter:
         lines = [] if self._number else [self._stream_line]
         size = sum(map(len, lines))
         while self._waiting and size < MAX_JSON:
-            _, line, definition = self._waiting[0]
+            _, line, definition, topic = self._waiting[0]
             said = definition is None or self._defined.get(definition[0]) == definition[1]
             new = [line] if said or definition is None else [definition[1], line]
             if len(lines) + len(new) > MAX_RECORDS:
@@ -128,6 +130,7 @@ class LogWriter:
             lines += new
             size += sum(map(len, new))
             self._bytes -= len(line)
+            self.sealed[topic] += 1
             self._waiting.popleft()
         return self._seal(lines, wall_ms, goodbye=last and not self._waiting)
 

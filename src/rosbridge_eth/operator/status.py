@@ -250,7 +250,7 @@ def of_robot(place: RobotHome) -> Report:
                 report["unknown"].append(("robot", _SILENT))
             report["alarms"] += [("log", FORKED) for name, _, value in running
                                  if name == "forked_seconds" and time.time() - value < FORKED_FOR]  # fmt: skip
-            report["figures"] = _of_robot(running)
+            report["figures"], report["records"] = _of_robot(running), _by_topic(running)
     return report
 
 
@@ -261,9 +261,19 @@ def _of_robot(running: Iterable[Figure]) -> dict[str, float]:
             for name, labels, value in running if name in wanted}  # fmt: skip
 
 
-def robot_picture(name: str, session: str, running: Iterable[Figure]) -> RenderableType:
+def _by_topic(running: Iterable[Figure]) -> dict[str, dict[str, float]]:
+    """Topic to the states of its records, and how many are in each."""
+    found: dict[str, dict[str, float]] = {}
+    for name, labels, value in running:
+        if name == "records":
+            found.setdefault(labels["topic"], {})[labels["state"]] = value
+    return found
+
+
+def robot_picture(name: str, session: str, running: Sequence[Figure]) -> RenderableType:
     """The picture of a running robot at its terminal, from its own figures."""
-    return table(name, ["what", "value"], [("session", session), *_rows(_of_robot(running))])
+    rows = [("session", session), *_rows(_of_robot(running))]
+    return Group(_records(_by_topic(running)), table(name, ["what", "value"], rows))
 
 
 def _rows(figures: Mapping[str, float]) -> Iterator[tuple[str, str]]:
@@ -299,6 +309,13 @@ def _robots(report: Report) -> RenderableType:
         ))  # fmt: skip
     title = "Robots: chunks that wait (how long) and that are on the chain, up to a block"
     return table(title, columns, rows, right=range(2, 9))
+
+
+def _records(topics: Mapping[str, Mapping[str, float]]) -> RenderableType:
+    states = ["captured", "sealed", "waiting", "confirmed"]
+    rows = [(topic, *(_figure(topics[topic], state, ",.0f") for state in states)) for topic in sorted(topics)]
+    return table("Records, and of those sealed in chunks what waits for the chain", ["topic", *states], rows,
+                 right=range(1, 5))  # fmt: skip
 
 
 def _figure(of: Mapping[str, Any], key: str, form: str) -> str:
@@ -343,6 +360,8 @@ def _show_robot(report: Report) -> Iterator[RenderableType]:
         ("spool", kept), *_process(report),
         *_rows(report.get("figures", {})),
     ])  # fmt: skip
+    if "records" in report:
+        yield _records(report["records"])
     yield from _alarms(report)
 
 

@@ -15,7 +15,7 @@ import os
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
@@ -31,6 +31,7 @@ from rosbridge_eth.config.values import Address, counted, parse_address
 from rosbridge_eth.errors import BridgeError, ConfigError, StoreError
 from rosbridge_eth.identity import Role, Trust, load_identity, read_certificates
 from rosbridge_eth.log.chunk import MAX_READERS, STREAM_SIZE, Chunk, Log, drop, robot_id
+from rosbridge_eth.log.store import place_of
 from rosbridge_eth.log.writer import LogWriter
 from rosbridge_eth.robot.blackbox import BlackBox
 from rosbridge_eth.robot.sender import Sender
@@ -52,6 +53,7 @@ LOOK_EVERY = 1.0  # seconds between looks at what was lost, and at whether the k
 CLOCKS_APART = 60.0  # seconds between this clock and the server's that are worth a warning
 SPOOL_AGAIN = 1.0  # seconds before a spool that took nothing is tried again
 MAX_UNSPOOLED = 16  # chunks kept in memory while the spool takes nothing; then nothing more is captured
+MARKS = 512  # places of the log for which it is known how many records of each topic are sealed up to there
 LAST_WORDS_TIME = 1.0  # seconds after `stop` to hand over what is left
 
 _TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
@@ -74,8 +76,10 @@ class Robot:
         self.capture, self.writer, self.spool, self.box = capture, writer, spool, box or BlackBox(())
         self.client, self.sender, self.loop = client, sender, ClientLoop(client, servers, self.handle)
         self.source, self.chunks = source, 0
-        self.captured = 0
-        """Records given to the writer; what is kept in memory for an event is not among them."""
+        self.written = Counter[str]()
+        """Records given to the writer, by topic."""
+        self._marks: deque[tuple[bytes, Counter[str]]] = deque()  # place, and records sealed up to there
+        self._confirmed = Counter[str]()
         self._queue = Queue(LIVE_BYTES if source.live else REPLAYED_BYTES, waits=not source.live)
         self._stop, self._source_ended = threading.Event(), threading.Event()
         self._source_error: BaseException | None = None
@@ -116,6 +120,21 @@ class Robot:
     @property
     def _source_lost(self) -> dict[tuple[str, str], int]:
         return {**self.source.lost, **self._queue.lost}
+
+    @property
+    def captured(self) -> int:
+        """Records given to the writer; what is kept in memory for an event is not among them."""
+        return self.written.total()
+
+    def confirmed(self) -> Counter[str]:
+        """Records confirmed on the chain since the start, by topic: those up to the newest place that is confirmed.
+
+        A chunk holds records of all topics, so what is kept are places of the log and not records. Of more than MARKS
+        places that wait every second is left out: then it is less, by less than what one of them stands for.
+        """
+        while self._marks and self._marks[0][0] <= self.sender.newest:
+            self._confirmed = self._marks.popleft()[1]
+        return self._confirmed
 
     def run(self, *, on_turn: Callable[[], None] = lambda: None) -> None:
         """Until `stop`, or until the source has ended and the server has everything.
@@ -212,9 +231,9 @@ class Robot:
             self._write(record, now)
 
     def _write(self, record: Record, now: float) -> None:
-        self.writer.add(record.line, now, record.definition)
+        self.writer.add(record.line, now, record.definition, topic=record.topic)
         if record.definition is not None:  # else it is no message
-            self.captured += 1
+            self.written[record.topic] += 1
 
     def _add_losses(self, now: float) -> None:
         for line in self.capture.loss_lines({**self._source_lost, **self.box.lost}):
@@ -229,6 +248,10 @@ class Robot:
         """Append, in order; while the spool takes nothing the chunks wait in memory, and then messages in the queue."""
         self._unspooled.extend(chunks)
         self.chunks += len(chunks)
+        if chunks:
+            self._marks.append((place_of(chunks[-1].header), self.writer.sealed.copy()))
+            if len(self._marks) > MARKS:
+                self._marks = deque([*self._marks][::-2][::-1])
         self._spool_or(None, "append", now, self._append)
 
     def _append(self) -> None:

@@ -237,8 +237,8 @@ def of_submitter(
 
 def of_robot(name: str, robot: Robot, wall: float) -> Iterator[Figure]:
     """A robot's capture, spool and session. Raises StoreError."""
-    for key in [key for key in FIGURES if key[0].startswith("trigger_")]:  # a reload may have removed it
-        del FIGURES[key]
+    for key in [key for key in FIGURES if key[0] == "records" or key[0].startswith("trigger_")]:
+        del FIGURES[key]  # a reload may have removed the trigger; what is confirmed may be known no more
     yield "beat_seconds", {"process": "robot"}, wall
     yield from _channel("robot", robot.client.statistics(), robot.loop.lost_sends)
     yield "captured", {"robot": name}, robot.captured
@@ -249,6 +249,14 @@ def of_robot(name: str, robot: Robot, wall: float) -> Iterator[Figure]:
     for (topic, why), count in robot.lost.items():
         yield "lost", {"robot": name, "topic": topic, "why": why}, count
     spool = robot.spool.statistics()
+    known = not robot.sender.refused and not spool.dropped_bodies  # else what is below a confirmed place may be absent
+    for topic, captured in robot.written.items():
+        sealed, confirmed = robot.writer.sealed[topic], robot.confirmed()[topic]
+        yield "records", {"robot": name, "topic": topic, "state": "captured"}, captured
+        yield "records", {"robot": name, "topic": topic, "state": "sealed"}, sealed
+        if known:
+            yield "records", {"robot": name, "topic": topic, "state": "waiting"}, sealed - confirmed
+            yield "records", {"robot": name, "topic": topic, "state": "confirmed"}, confirmed
     yield "spool_chunks", {"robot": name, "state": "all"}, spool.chunks
     yield "spool_chunks", {"robot": name, "state": "not stored"}, spool.unstored
     yield "spool_chunks", {"robot": name, "state": "set aside"}, spool.aside

@@ -34,7 +34,8 @@ from rosbridge_eth.terminal import Trouble
 log = logging.getLogger(__name__)
 
 TURN = 0.05  # seconds that chunks are gathered for one commit
-ENOUGH = 64  # chunks, for which a commit does not wait
+ENOUGH = 64  # chunks, for which a commit does not wait; and those of one robot that a commit looks at
+WAITING = 2 * ENOUGH  # chunks of one robot that wait for a commit; what comes beyond them is not taken
 LOOK_EVERY = 1.0  # seconds between looks at what the submitter and the operator changed
 HELD = 5.0  # seconds before a robot that was told why nothing is taken may try again
 WELL_AFTER = 3 * HELD  # seconds without a failed commit, after which a store that answers counts as well
@@ -67,6 +68,7 @@ class Session:
     why: str = ""
     until: float = 0.0
     state: State = field(default_factory=State)
+    behind: bool = False  # something was not taken since the robot was last told
     again: int = 0
     refused: bytes = NO_DIGEST
 
@@ -141,16 +143,10 @@ class Reception:
         self._commit_at = min(self._commit_at, now + TURN)
         if session.why:
             self._turn_away(session)
-            return
-        try:
-            verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, chunk)
-        except (Forged, Altered) as error:
-            self.counts["refused"] += 1
-            self._tell(session, "a chunk is refused", now, f": {error}")
-            session.refused = chunk.header.digest
-            self._turn_away(session)
-            return
-        session.offers.append(Offer(session.tk, chunk, after))
+        elif len(session.offers) < WAITING:
+            session.offers.append(Offer(session.tk, chunk, after))
+        else:
+            session.behind = True
 
     # The turn
 
@@ -170,12 +166,12 @@ class Reception:
             self.look(now, [*self.sessions.values()])
 
     def commit(self, now: float, wall: float) -> None:
-        """Everything gathered goes into the store; then each robot is told how far its log is there."""
+        """What was gathered goes into the store, ENOUGH of each robot; then each is told how far its log is there.
+
+        So a robot that floods the server costs the others a bounded time in each turn.
+        """
         waiting = [session for connection, session in self._due.items() if connection in self.sessions]
-        self._commit_at, self._due = NEVER, {}
-        offered = [(session, offer) for session in waiting for offer in session.offers]
-        for session in waiting:
-            session.offers = []
+        offered = [(session, offer) for session in waiting for offer in self._verified(session, now)]
         try:
             outcomes = self._store.append([offer for _, offer in offered], wall) if offered else []
             self._failed_at = -NEVER if offered else self._failed_at
@@ -187,7 +183,23 @@ class Reception:
         else:
             for (session, offer), outcome in zip(offered, outcomes, strict=True):
                 self._note(session, offer.chunk, outcome, now)
+        self._due = {session.connection: session for session in waiting if session.offers}
+        self._commit_at = now if self._due else NEVER
         self.look(now, waiting)
+
+    def _verified(self, session: Session, now: float) -> list[Offer]:
+        """The next offers of a session, up to the first that is not this robot's; those that follow it are dropped."""
+        offers, session.offers = session.offers[:ENOUGH], session.offers[ENOUGH:]
+        for number, offer in enumerate(offers):
+            try:
+                verify(Log(self._ledger, session.tk), session.peer.signing_certificate.public_key, offer.chunk)
+            except (Forged, Altered) as error:
+                self.counts["refused"] += 1
+                self._tell(session, "a chunk is refused", now, f": {error}")
+                session.refused = offer.chunk.header.digest
+                self._turn_away(session)
+                return offers[:number]
+        return offers
 
     def _note(self, session: Session, chunk: Chunk, outcome: Outcome, now: float) -> None:
         self.counts[outcome.name.lower()] += 1
@@ -232,8 +244,8 @@ class Reception:
     # What a robot is told
 
     def _turn_away(self, session: Session, why: str = "", until: float = -NEVER) -> None:
-        """What came was not taken: the robot is to go on from the head, once nothing stands in the way."""
-        session.again = (session.again + 1) % 256
+        """What came is not taken: the robot is to go on from the head, once nothing stands in the way."""
+        session.offers, session.behind = [], True
         self._hold(session, why, until)
 
     def _hold(self, session: Session, why: str, until: float) -> None:
@@ -253,6 +265,7 @@ class Reception:
     def _say(self, session: Session) -> None:
         """Have the robot told how its log stands here."""
         state = session.state
+        session.again, session.behind = (session.again + session.behind) % 256, False
         self.server.set_state(session.connection, ServerState(
             state.head, state.digest, state.confirmed, state.block, session.again, session.refused, session.why
         ).encode())  # fmt: skip

@@ -82,6 +82,21 @@ def test_a_running_robot_is_shown_at_its_terminal_by_its_own_figures(place: Plac
         assert re.search("spool chunks set aside +1", out.getvalue())
 
 
+def test_the_records_of_a_topic_are_shown_and_what_is_confirmed_only_while_it_is_known(place: Place) -> None:
+    robot = opened(place, NO_SERVER + ODOM + BAG)
+    run_to_the_sources_end(robot)
+    again = open_robot(place.robot, load_robot_config(place.robot.config), PASSWORD)
+    again.written, again.writer.sealed["/robot_1/odom"] = robot.written, robot.captured - 10
+    count = robot.captured
+    with closing(again.spool), closing(again.loop):
+        for refused, states in (0, f"{count} +{count - 10} +{count - 10} +0"), (1, rf"{count} +{count - 10} +\? +\?"):
+            again.sender.refused = refused
+            metrics.show(metrics.of_robot("robot_1", again, 0.0))
+            shown = Console(width=80, file=(out := io.StringIO()))
+            shown.print(robot_picture("robot_1", "no session yet", metrics.figures()))
+            assert re.search(f"/robot_1/odom +{states}", out.getvalue())
+
+
 def test_a_disk_that_is_full_when_a_session_begins_does_not_end_a_robot(tmp_path: Path, caplog: Logged) -> None:
     with disks.small_disk(tmp_path / "disk", "5m") as disk:
         home = lone_robot(disk)
