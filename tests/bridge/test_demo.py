@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.capture import MessageLine
+from rosbridge_eth.cli import run
 from rosbridge_eth.cli.demo import DemoResult, run_demo
+from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.reading import Kind
 from rosbridge_eth.reading.compare import compare
 from rosbridge_eth.robot.loop import Robot
@@ -92,6 +94,12 @@ def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatc
     assert stopped.verdict.sound and stopped.verdict.head is not None
     assert stopped.verdict.head.goodbye  # nothing after the last record can have been withheld
     assert not stopped.passed
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["demo", "--report", "/proc/x"]) == ExitCode.CONFIG
+    said = capsys.readouterr().err
+    assert "/proc/x cannot be written" in said and "--report" in said and "keys" not in said
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from rich.table import Table
 from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
-from rosbridge_eth.errors import BridgeError, VerificationError
+from rosbridge_eth.errors import BridgeError, ConfigError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.operator import enrolment
@@ -227,7 +227,11 @@ def demo(
     Exits with 9 if a single record is missing, altered or doubled.
     """
     log_to_stderr()
-    report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
+    try:  # what cannot be written is told now, not after all the work
+        report.mkdir(parents=True, exist_ok=True)
+        (report / "report.html").touch()
+    except OSError as error:
+        raise ConfigError(f"{report} cannot be written: {error.strerror}; choose another --report") from error
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
     with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
