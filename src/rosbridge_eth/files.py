@@ -18,7 +18,8 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,15 @@ def read_file(path: Path, *, private: bool = False) -> bytes:
     return content
 
 
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """What is wrong with the content of a file is told with its name."""
+    try:
+        yield
+    except IdentityError as error:
+        raise IdentityError(f"{path}: {error}") from error
+
+
 def seal_box(secret: bytes, password: bytes, head: Mapping[str, Any], *, n: int = SCRYPT_N) -> bytes:
     """`secret` under `password`, as a file's bytes. head: shown in the clear; its "format" says what it is."""
     if not password:
@@ -76,6 +86,7 @@ def seal_box(secret: bytes, password: bytes, head: Mapping[str, Any], *, n: int 
     return json.dumps({**shown, "sealed": base64.b64encode(sealed).decode()}, indent=1).encode() + b"\n"
 
 
+_MADE_BY = {"request": "`join --name`", "bundle": "`register`", "accounts": "`init`"}
 _MAX_BRACKETS = 100  # of nesting json.loads makes recursion, which py-evm allows up to where the stack ends
 
 
@@ -91,7 +102,8 @@ def box_head(data: bytes, expected: str) -> dict[str, Any]:
         head = json.loads(data)
         given = head["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise IdentityError(f"this is no {thing} file of this program, or it was damaged") from error
+        made = f"give the {thing} that {_MADE_BY[thing]} wrote"
+        raise IdentityError(f"this is no {thing} file of this program, or it was damaged; {made}") from error
     if given != expected:
         raise IdentityError(f"this {thing} file has another format than {expected!r}; use one version on both ends")
     return dict(head)

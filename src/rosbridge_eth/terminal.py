@@ -137,13 +137,14 @@ def print_json(value: Any) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: Sequence[int] = ()) -> Table:
-    """A table whose cells are plain text; `right` are the columns aligned to the right."""
+    """A table whose cells are plain text. right: the columns aligned to the right, of figures, which are not broken."""
     made = Table(
         title=Text(title, "table.title"), title_justify="left", header_style="bold", box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )  # fmt: skip
     for index, column in enumerate(columns):
-        made.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
+        figures = index in right
+        made.add_column(column, justify="right" if figures else "left", overflow="fold", no_wrap=figures)
     for row in rows:
         made.add_row(*(plain(str(cell)) for cell in row))
     return made

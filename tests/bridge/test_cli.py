@@ -143,7 +143,7 @@ def test_a_wrong_passphrase_is_told(capsys: Capture) -> None:
           "--new-passphrase-file", "word")
 
 
-def test_a_key_that_others_can_read_is_refused_with_the_mend(capsys: Capture) -> None:
+def test_a_key_that_others_can_read_is_refused_with_the_fix(capsys: Capture) -> None:
     Path("robot/robot.toml").write_text(f'{ODOM}[source]\nkind = "sim"\n')
     Path("robot/identity/sign.key.pem").chmod(0o644)
     fails(capsys, ExitCode.IDENTITY, "chmod 600", "robot", "--password-file", "word")
@@ -169,7 +169,8 @@ def test_a_robot_that_cannot_be_registered_leaves_nothing(capsys: Capture) -> No
     fails(capsys, ExitCode.CHAIN, "127.0.0.1:9", "register", "robot_2", *OPERATOR, "--password-file", "word")
     assert not Path("operator/bundles/robot_2.bundle").exists()
     fails(capsys, ExitCode.CONFIG, "absent", "register", "robot_2", "absent", *OPERATOR)
-    fails(capsys, ExitCode.IDENTITY, "no request file", "register", "robot_2", "word", *OPERATOR)
+    for said in ("word: this is no request file", "give the request that `join --name` wrote"):
+        fails(capsys, ExitCode.IDENTITY, said, "register", "robot_2", "word", *OPERATOR)
 
 
 @pytest.mark.parametrize("name", ["", "Robot", "../x", "a" * 64, "-x", "é"])
@@ -198,7 +199,8 @@ def test_a_corrupt_bag_is_told(place: Place, capsys: Capture) -> None:
 
 
 def test_a_bundle_that_is_none_is_told(capsys: Capture) -> None:
-    fails(capsys, ExitCode.IDENTITY, "no bundle file", "join", "word", "--home", "other", "--password-file", "word")
+    told = "word: this is no bundle file"
+    fails(capsys, ExitCode.IDENTITY, told, "join", "word", "--home", "other", "--password-file", "word")
     fails(capsys, ExitCode.CONFIG, "absent", "join", "absent", "--home", "other", "--password-file", "word")
     fails(capsys, ExitCode.CONFIG, "request", "join", BUNDLE, "--home", "other")
     assert not Path("other").exists()

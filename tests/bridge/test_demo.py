@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 
 from rosbridge_eth.capture import MessageLine
-from rosbridge_eth.cli.demo import DemoResult, run_demo
+from rosbridge_eth.cli import run
+from rosbridge_eth.cli.demo import DemoResult, _page, run_demo
+from rosbridge_eth.errors import ExitCode
 from rosbridge_eth.reading import Kind
 from rosbridge_eth.reading.compare import compare
 from rosbridge_eth.robot.loop import Robot
@@ -94,6 +96,24 @@ def test_a_robot_that_is_stopped_says_so_on_the_chain(tmp_path: Path, monkeypatc
     assert not stopped.passed
 
 
+def test_the_report_says_what_failed_and_escapes_what_others_wrote(result: DemoResult) -> None:
+    altered = [*contents(result)[:-1], contents(result)[0]]
+    failed = replace(
+        result, comparison=compare(sample_bag(), [TOPIC], altered), verdict=replace(result.verdict, robot="<script>"),
+    )  # fmt: skip
+    passed, page = _page(result, "drive.bag", "", []), _page(failed, "<i>.bag", "", [])
+    assert 'class="verdict good">Every record came back' in passed and "drive.bag" in passed
+    assert 'class="verdict bad">Not every record came back' in page and "no record of this message" in page
+    assert "<b>300</b>records captured" in page and "<b>299</b>equal" in page
+    assert "&lt;script&gt;" in page and "&lt;i&gt;.bag" in page and "<script>" not in page and "<i>" not in page
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["demo", "--report", "/proc/x"]) == ExitCode.CONFIG
+    said = capsys.readouterr().err
+    assert "/proc/x cannot be written" in said and "--report" in said and "keys" not in said
+
+
 @pytest.mark.slow
 def test_the_command_prints_the_stages_and_leaves_a_report(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
@@ -107,4 +127,4 @@ def test_the_command_prints_the_stages_and_leaves_a_report(tmp_path: Path) -> No
     assert len((tmp_path / "report" / "records.jsonl").read_text().splitlines()) == 300
     page = (tmp_path / "report" / "report.html").read_text()
     assert "Every record came back" in page and "<pre" not in page
-    assert re.search(r'<h2>Records</h2>.*<td>records captured<td class="number">300<tr>', page)
+    assert "<b>300</b>records captured" in page and "<h2>Transactions to 0x" in page

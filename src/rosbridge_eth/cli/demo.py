@@ -30,7 +30,8 @@ from rich.table import Table
 from rosbridge_eth.channel.udp import server_socket
 from rosbridge_eth.config import load_robot_config, load_server_config
 from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome
-from rosbridge_eth.errors import BridgeError, VerificationError
+from rosbridge_eth.config.values import time_text
+from rosbridge_eth.errors import BridgeError, ConfigError, VerificationError
 from rosbridge_eth.identity import Trust, load_ca, load_identity
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.operator import enrolment
@@ -46,7 +47,10 @@ from rosbridge_eth.terminal import data, errors, log_to_stderr, table, talk
 ROBOT = "robot_1"
 FUNDS = 1000 * 10**18
 SETTLE = 60.0  # seconds for the last chunk to be confirmed
-PICTURE = '<img src="trajectory.png" alt="The trajectory, drawn from the records on the chain">'
+PICTURE = (
+    '<figure><img src="trajectory.png" alt="The trajectory">'
+    "<figcaption>The trajectory, drawn from the records on the chain</figcaption></figure>"
+)
 NO_PICTURE = "<p>With matplotlib, the trajectory is drawn here: pip install 'pysmcrypto[plot]'</p>"
 
 
@@ -207,7 +211,36 @@ def _html(table: Table) -> str:
     rows = zip(*([escape(str(cell)) for cell in column.cells] for column in table.columns), strict=True)
     head = "".join(f"<th{kind}>{escape(str(each.header))}" for kind, each in zip(kinds, table.columns, strict=True))
     body = "".join("<tr>" + "".join(f"<td{kind}>{cell}" for kind, cell in zip(kinds, row, strict=True)) for row in rows)
-    return f"<h2>{escape(str(table.title))}</h2><div><table><tr>{head}{body}</table></div>\n"
+    return f"<h2>{escape(str(table.title))}</h2><div class=table><table><tr>{head}{body}</table></div>\n"
+
+
+def _page(result: DemoResult, bag: str, picture: str, tables: Sequence[Table]) -> str:
+    """The report. What a bag, a robot or a node wrote is escaped."""
+    verdict, gas = result.verdict, sum(each.gas for each in result.transactions)
+    figures = [
+        (f"{result.captured:,}", "records captured"), (f"{len(result.records):,}", "records proven"),
+        (f"{result.comparison.equal:,}", "equal to the bag's"),
+        (f"{gas / max(1, len(result.records)):,.0f}", "gas a record"), (f"{result.seconds:.1f} s", "for all of it"),
+    ]  # fmt: skip
+    log = [
+        ("Robot", verdict.robot), ("Verdict", "sound" if verdict.sound else "NOT SOUND"),
+        ("Contract", result.contract), ("Chunks", f"{verdict.chunks}, read up to block {verdict.block}"),
+    ]  # fmt: skip
+    if head := verdict.head:
+        log.append(("Last chunk", f"sealed at {time_text(head.sealed_ms * 10**6)} by the robot's clock"))
+        end = "said goodbye: nothing is missing at the end" if head.goodbye else "not said goodbye: more may follow"
+        log.append(("End", f"The robot has {end}"))
+    log += [("Certificate", str(each)) for each in verdict.certificates]
+    notes = "".join(f"<li>{escape(str(note))}" for note in (*verdict.findings, *result.comparison.differences))
+    passed = "Every record came back, proven and equal to the bag's."
+    return Template((resources.files(__package__) / "report.html").read_text("utf-8")).substitute(
+        bag=escape(f"The bag {bag}, sent over UDP, written to an Ethereum contract, read back from the chain alone"),
+        mood="good" if result.passed else "bad",
+        verdict=passed if result.passed else "Not every record came back as it is in the bag.",
+        figures="".join(f"<p><b>{number}</b>{what}</p>" for number, what in figures), picture=picture,
+        log="".join(f"<dt>{name}<dd>{escape(value)}" for name, value in log),
+        notes=f"<h2>Notes</h2><ul>{notes}</ul>" if notes else "", tables="".join(map(_html, tables)),
+    )  # fmt: skip
 
 
 # The command
@@ -227,7 +260,11 @@ def demo(
     Exits with 9 if a single record is missing, altered or doubled.
     """
     log_to_stderr()
-    report.mkdir(parents=True, exist_ok=True)  # what cannot be written is told now, not after all the work
+    try:  # what cannot be written is told now, not after all the work
+        report.mkdir(parents=True, exist_ok=True)
+        (report / "report.html").touch()
+    except OSError as error:
+        raise ConfigError(f"{report} cannot be written: {error.strerror}; choose another --report") from error
     chosen, topics = bag or sample_bag(), topic or [f"/{ROBOT}/odom"]
     with tempfile.TemporaryDirectory(prefix="rosbridge-eth-") as home, errors.status("") as progress:
 
@@ -260,12 +297,7 @@ def demo(
         table("Time", ["step", "time"], times, right=[1]),
         table(f"Transactions to {result.contract}", heads, batches, right=[0, 1, 2, 3, 4]),
     ]
-    passed = "Every record came back, proven and equal to the bag's." if result.passed else "Not all came back."
-    lines = "<br>".join(escape(line) for line in (f"{passed} The bag is {chosen.name}.", *said))
-    page = Template((resources.files(__package__) / "report.html").read_text("utf-8")).substitute(
-        colour="#2a7" if result.passed else "#c33", verdict=lines, picture=picture, tables="".join(map(_html, tables))
-    )
-    (report / "report.html").write_text(page, encoding="utf-8")
+    (report / "report.html").write_text(_page(result, chosen.name, picture, tables[1:]), encoding="utf-8")
     data.print(*tables)
     for line in said:
         talk(line)

@@ -19,7 +19,7 @@ from rosbridge_eth.config.home import OperatorHome, ReaderHome, RobotHome, shard
 from rosbridge_eth.config.passphrases import read_passphrase
 from rosbridge_eth.config.values import Address, counted
 from rosbridge_eth.errors import ChainError, ConfigError
-from rosbridge_eth.files import write_atomically
+from rosbridge_eth.files import naming, write_atomically
 from rosbridge_eth.identity import CertificateAuthority, Role, load_ca
 from rosbridge_eth.ledger import Keyring, Ledger
 from rosbridge_eth.log.chunk import robot_id
@@ -227,7 +227,10 @@ def register(
 
     Without a request, name and password do (the paper's easy_register); the operator could then sign as the robot.
     """
-    asked = None if request is None else Request.decode(terminal.read_given(request))
+    asked = None
+    if request is not None:
+        with naming(request):
+            asked = Request.decode(terminal.read_given(request))
     place, passphrase, keys = _opened(home, passphrase_file)
     prompt = f"Registration password of {name}"
     secret = None if asked else read_passphrase("robot", prompt, file=password_file, confirm=True)

@@ -24,6 +24,7 @@ from rosbridge_eth.config.home import RobotHome, require_empty
 from rosbridge_eth.config.models import BagConfig, SimConfig
 from rosbridge_eth.config.passphrases import read_passphrase, warn_if_others_read
 from rosbridge_eth.errors import ConfigError, StoreError
+from rosbridge_eth.files import naming
 from rosbridge_eth.identity import check_name
 from rosbridge_eth.log.chunk import STREAM_SIZE
 from rosbridge_eth.operator import bundle as bundles
@@ -123,9 +124,11 @@ def _choose(offers: Sequence[Offer], suggested: list[str]) -> list[str]:
 
 def _join_with(bundle: Path, place: RobotHome, password_file: Path | None) -> None:
     content = terminal.read_given(bundle)
-    sealed = bundles.needs_password(content)
+    with naming(bundle):
+        sealed = bundles.needs_password(content)
     secret = read_passphrase("robot", "Registration password", file=password_file) if sealed else None
-    opened = bundles.read_bundle(content, secret)
+    with naming(bundle):
+        opened = bundles.read_bundle(content, secret)
     _say_who(bundles.join(place, opened, secret))
     talk(f"{place.path} is now the home of {opened.end.robot}. Name its topics in {place.config}, then run `robot`.")
 

@@ -182,12 +182,12 @@ def join(home: RobotHome, bundle: Bundle, password: bytes | None = None) -> Join
         reader = ids.public_identity(pem.encode())
         trust.check(*reader.pair, role=ids.Role.READER, name=name, at=max(peer.not_before, reader.not_before))
     before = None
-    with suppress(OSError, BridgeError):  # absent, or damaged, which joining again mends
+    with suppress(OSError, BridgeError):  # absent, or damaged, which joining again repairs
         before = ids.public_identity(b"".join((home.identity / name).read_bytes() for name in CERTIFICATE_FILES[:2]))
     if before is not None and peer.not_before < before.not_before:
         raise IdentityError("this bundle is older than the one that this robot joined with; have it registered again")
     known = None
-    with suppress(ConfigError):  # absent, or damaged, which joining again mends
+    with suppress(ConfigError):  # absent, or damaged, which joining again repairs
         known = home.bridge().ledger
     if known not in (None, bundle.end.ledger):
         raise ConfigError(f"{home.path} writes to another ledger already; choose another folder")
@@ -229,8 +229,8 @@ def join_with_answer(home: RobotHome) -> Joined | None:
 
 def _require_answer(home: RobotHome, peer: ids.PeerIdentity) -> None:
     """Return if the certificates are for the keys of this home's request."""
-    mend = "this bundle answers the request of a robot that made its own keys: join in that robot's home"
-    home_of(home.path, HomeKind.ROBOT, mend)
+    fix = "this bundle answers the request of a robot that made its own keys: join in that robot's home"
+    home_of(home.path, HomeKind.ROBOT, fix)
     if not home.request.exists():
         raise IdentityError(f"{home.path} has made no request that this bundle could answer; join in a new folder")
     request = Request.decode(home.request.read_bytes())

@@ -31,7 +31,7 @@ from rosbridge_eth.files import read_file
 from rosbridge_eth.operator import status
 from rosbridge_eth.operator.status import span
 from rosbridge_eth.robot.loop import certificate_clock, clock_synchronised, reader_keys
-from rosbridge_eth.robot.sender import mend
+from rosbridge_eth.robot.sender import fix
 from rosbridge_eth.terminal import OPERATOR_HOME, AnyHomeOption, Json, data, print_json, table, talk
 
 HANDSHAKE_TIME, ATTEMPT_TIME = 6.0, 2.5  # seconds for a server to answer; for an attempt, with which a refusal is known
@@ -260,7 +260,7 @@ def try_session(
         return
     # A refusal with its reason first: one attempt may have lost what another was told.
     why = min(failed, key=lambda failure: failure.hint is None, default=HandshakeFailed("no answer"))
-    yield broken("server", f"{server}: {why.why}", mend(why, config.channel)
+    yield broken("server", f"{server}: {why.why}", fix(why, config.channel)
                  if client.statistics()["datagrams_received"] else
                  f"is the server up, its `public` address right, UDP port {server.port} open in every firewall between,"
                  f' and does it take channel = "{config.channel}" (`channel` in its server.toml)?')

@@ -297,18 +297,17 @@ def _process(report: Report) -> list[tuple[str, object]]:
 
 
 def _robots(report: Report) -> RenderableType:
-    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "block", "Mgas", "ETH"], []
+    columns, rows = ["robot", "session", "newest", "rec/s", "waiting", "on chain", "Mgas", "ETH"], []
     for name, robot in report["robots"].items():
         waiting, session = robot.get("waiting", {}), {None: "?", False: "no", True: "yes"}[robot.get("connected")]
         oldest = f" ({span(waiting['oldest'])})" if waiting.get("oldest") else ""
         rows.append((
             name, session if robot["in_force"] else "revoked", span(robot.get("newest")),
             _figure(robot, "rate", ".1f"), _figure(waiting, "chunks", ".0f") + oldest,
-            _figure(robot, "chunks", ".0f"), _figure(robot, "block", ".0f"),
-            f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?", _figure(robot, "eth", ".4f"),
+            _figure(robot, "chunks", ".0f"), f"{robot['gas'] / 1e6:.1f}" if "gas" in robot else "?",
+            _figure(robot, "eth", ".4f"),
         ))  # fmt: skip
-    title = "Robots: chunks that wait (how long) and that are on the chain, up to a block"
-    return table(title, columns, rows, right=range(2, 9))
+    return table("Robots: chunks that wait (how long) and that are on the chain", columns, rows, right=range(1, 8))
 
 
 def _records(topics: Mapping[str, Mapping[str, float]]) -> RenderableType:

@@ -46,7 +46,7 @@ REFUSED_RIGHT = (
 )
 
 
-def mend(failure: HandshakeFailed, channel: str) -> str:
+def fix(failure: HandshakeFailed, channel: str) -> str:
     """What to do about a session that did not come about; `channel` is the configured mode."""
     match failure.hint:
         case Reason.NOT_ALLOWED | Reason.CERTIFICATE:
@@ -130,7 +130,7 @@ class Sender:
                     self.refusal = TWICE
                     self._warn(TWICE, TWICE, now)
             case HandshakeFailed(why=why) | Unresolved(why=why):
-                todo = "" if isinstance(event, Unresolved) else f"; {mend(event, self._channel)}"
+                todo = "" if isinstance(event, Unresolved) else f"; {fix(event, self._channel)}"
                 self.refusal = why + todo
                 self._warn(why, f"no session: {self.refusal}", now)
             case State(data=data):

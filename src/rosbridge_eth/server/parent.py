@@ -79,15 +79,11 @@ class Parent:
         on_ready: called with the addresses that are listened on; on_look: after every look at the children.
         """
         config = self._checked()
-        addresses = [config.listen.next(shard) for shard in self._shards(config)]
-        for shard, address in zip(self._shards(config), addresses, strict=True):  # a second server gets no further
-            server_socket(address).close()
-            metrics.require_free(config.monitor and config.monitor.next(shard))
         for signaled in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(signaled, self._on_signal)
         try:
             self._begin(config)
-            on_ready(addresses)
+            on_ready(self._addresses(config)[0])
             notify("READY=1")
             while not self._stop.wait(WATCH):
                 if self._again.is_set():
@@ -109,8 +105,16 @@ class Parent:
     def _shards(self, config: ServerConfig) -> Sequence[int]:
         return self._only or range(config.shards)
 
-    def _checked(self) -> ServerConfig:
-        """server.toml, whose chain is the right one and whose stores keep what they are given: else BridgeError."""
+    def _addresses(self, config: ServerConfig | None) -> tuple[list[Address], list[Address]]:
+        """Where the shards take robots, and where they serve /metrics."""
+        if config is None:
+            return [], []
+        shards, monitor = self._shards(config), config.monitor
+        return [config.listen.next(shard) for shard in shards], [monitor.next(shard) for shard in shards if monitor]
+
+    def _checked(self, runs: ServerConfig | None = None) -> ServerConfig:
+        """server.toml, whose chain is the right one, whose stores keep what they are given, and whose ports are free or
+        used by the shards that run by `runs`: else BridgeError."""
         config = load_server_config(self._home.config)
         if wrong := [shard for shard in self._only if shard >= config.shards]:
             raise ConfigError(f"there is no shard {wrong[0]}: {self._home.config} has shards = {config.shards}")
@@ -122,6 +126,13 @@ class Parent:
         for shard in self._shards(config):
             with closing(open_store(config, self._home, shard)) as store:
                 store.check()
+        (robots_now, metrics_now), (robots, monitors) = self._addresses(runs), self._addresses(config)
+        for address in robots:  # a second server gets no further
+            if address.port not in {each.port for each in robots_now}:
+                server_socket(address).close()
+        for address in monitors:
+            if address.port not in {each.port for each in metrics_now}:
+                metrics.require_free(address)
         return config
 
     def _begin(self, config: ServerConfig) -> None:
@@ -134,7 +145,7 @@ class Parent:
     def _reload(self, config: ServerConfig) -> ServerConfig:
         """Begin again by server.toml. What cannot be used is told, and nothing changes."""
         try:
-            new = self._checked()
+            new = self._checked(config)
         except BridgeError as error:
             log.error("nothing is reloaded: %s", error)
             return config

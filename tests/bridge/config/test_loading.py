@@ -1,4 +1,4 @@
-"""Every kind of mistake in a configuration, and the sentence that mends it."""
+"""Every kind of mistake in a configuration, and the sentence that says how to fix it."""
 
 from __future__ import annotations
 

@@ -540,7 +540,7 @@ def test_an_old_backup_of_the_registry_does_not_stop_registrations(world: World,
 @pytest.mark.parametrize("step", [
     "Registry.revoke", "Registry.enrol", "Bundle.encode", "ledger.replace_registration", "ledger.alloc_eth", "_bury",
 ])
-def test_a_crash_between_any_two_steps_is_mended_by_doing_it_again(
+def test_a_crash_between_any_two_steps_is_repaired_by_doing_it_again(
     world: World, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = world.register()

@@ -282,7 +282,7 @@ def test_a_bundle_writes_no_file_but_an_identitys(home: RobotHome, tmp_path: Pat
     assert sorted(tmp_path.rglob("*")) == before and not Path(name).exists()
 
 
-def test_a_crash_while_joining_is_mended_by_joining_again(home: RobotHome, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crash_while_joining_is_repaired_by_joining_again(home: RobotHome, monkeypatch: pytest.MonkeyPatch) -> None:
     bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
     writes, real = 0, os.replace
 
@@ -319,7 +319,7 @@ def test_a_bundle_that_cannot_be_taken_up_ends_no_robot_that_has_joined(
     assert join_with_answer(home) is not None
 
 
-def test_a_damaged_bridge_file_is_mended_by_joining_again_as_its_error_says(home: RobotHome) -> None:
+def test_a_damaged_bridge_file_is_repaired_by_joining_again_as_its_error_says(home: RobotHome) -> None:
     bundle = answer(ask_to_join(home, "robot_1", b"robot's"))
     join(home, bundle)
     home.bridge_file.write_text('{"robot": "robot_1"')

@@ -83,6 +83,34 @@ def test_who_starts_a_second_one_by_mistake_leaves_the_first_its_figures(
     assert metrics.running(place.robot.path)["robot"]
 
 
+@pytest.mark.parametrize("key, kind", [("listen", socket.SOCK_DGRAM), ("monitor", socket.SOCK_STREAM)])
+def test_a_reload_that_names_a_port_that_is_taken_changes_nothing(
+    place: Place, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, key: str, kind: int
+):
+    begun: list[object] = []
+    monkeypatch.setattr(parent.Ledger, "check", lambda ledger: None)
+    monkeypatch.setattr(Parent, "_begin", lambda self, config: begun.append(config))
+    before = place.operator.config.read_text().replace('listen = "127.0.0.1:0"\n', "")
+
+    def configured(sock: socket.socket) -> None:
+        addresses = {"listen": "127.0.0.1:0", key: f"127.0.0.1:{sock.getsockname()[1]}"}
+        lines = "".join(f'{name} = "{address}"\n' for name, address in addresses.items())
+        place.operator.config.write_text(lines + before)
+
+    with socket.socket(socket.AF_INET, kind) as taken, socket.socket(socket.AF_INET, kind) as ours:
+        for sock in (taken, ours):
+            sock.bind(("127.0.0.1", 0))
+            if kind == socket.SOCK_STREAM:
+                sock.listen()
+        configured(ours)
+        config = load_server_config(place.operator.config)
+        configured(taken)
+        assert Parent(place.operator, SECRETS)._reload(config) is config and not begun
+        assert "nothing is reloaded" in caplog.text and "in use" in caplog.text
+        configured(ours)  # which the shards that run have, and give up
+        assert [Parent(place.operator, SECRETS)._reload(config)] == begun == [config]
+
+
 @pytest.mark.parametrize("text, only, says", [
     ("", [1], "there is no shard 1: .*shards = 1"),
     ('shards = 4\npublic = "0.0.0.0:7410"', [], "no machine can have"),

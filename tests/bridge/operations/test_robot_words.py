@@ -55,7 +55,7 @@ def warnings(caplog: Logged) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_a_reason_is_said_with_its_mend_and_at_most_once_a_minute(place: Place, caplog: Logged) -> None:
+def test_a_reason_is_said_with_its_fix_and_at_most_once_a_minute(place: Place, caplog: Logged) -> None:
     robot = opened(place, NO_SERVER + ODOM + BAG)
     for now in range(0, 121, 5):
         robot.sender.handle(HandshakeFailed("it is silent"), now)

@@ -335,8 +335,24 @@ def test_a_running_server_is_shown_at_its_terminal_by_its_own_figures(place: Pla
     metrics.save(metrics.file_of(place.operator.path, "shard-0"))
     screen.print(module.fleet(place.operator))
     shown = screen.export_text()
-    assert re.search(r"robot_1 +yes .* 7 \(5m\) .* 41 +99 ", shown), shown
+    assert re.search(r"robot_1 +yes .* 7 \(5m\) .* 41 ", shown), shown
     assert "robot_1: it is on hold" in shown and "has waited 5m" in shown
+
+
+@pytest.mark.parametrize("name", ["robot_1", "r" * 63])
+def test_no_word_or_figure_is_broken_at_eighty_columns(name: str):
+    from rich.console import Console
+
+    robot = {
+        "in_force": False, "newest": 108_000, "rate": 12_345.6, "waiting": {"chunks": 1234, "oldest": 4000},
+        "chunks": 1_234_567, "gas": 123_456.7e6, "eth": 1234.5678,
+    }  # fmt: skip
+    screen = Console(width=80, record=True, file=io.StringIO())
+    screen.print(module._robots({"robots": {name: robot}}))
+    shown = screen.export_text()
+    assert re.search("robot +session +newest +rec/s +waiting +on chain +Mgas +ETH", shown), shown
+    assert re.search(r" revoked +30h +12345.6 +1234 \(67m\) +1234567 +123456.7 +1234.5678 ", shown), shown
+    assert max(map(len, shown.split("\n"))) <= 80
 
 
 def test_what_a_robot_left_in_the_store_of_another_shard_is_not_counted(place: Place, capsys: Capture):

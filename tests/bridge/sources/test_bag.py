@@ -301,7 +301,17 @@ def test_a_bag_with_flipped_bytes_gives_messages_or_a_source_error(bag):
         attempt(bag)
 
 
-def test_a_recording_that_was_cut_off_names_the_mend(tmp_path):
+def test_a_recording_that_was_cut_off_names_the_fix(bag):
+    file = data_file(bag)
+    content = file.read_bytes()
+    fix = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`", ".db3": "`sqlite3 FILE .recover`"}[file.suffix]
+    for length in (len(content) // 2, len(content) - 1000):
+        file.write_bytes(content[:length])
+        with pytest.raises(SourceError, match=fix):
+            list(BagSource(bag, Selection(["**"])).messages())
+
+
+def test_a_recording_without_an_index_names_the_fix(tmp_path):
     path = tmp_path / "cut.bag"
     write_ros1(path)
     content = bytearray(path.read_bytes())

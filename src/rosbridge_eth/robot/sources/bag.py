@@ -28,6 +28,11 @@ log = logging.getLogger(__name__)
 
 MAX_WAIT_NS = 3600 * 10**9
 """A pause longer than this in a recording is a broken time stamp; it is replayed as this."""
+_REINDEX = "if its recording was cut off, run `rosbag reindex` on it"
+_RECOVER = (
+    "if its recording was cut off, repair an .mcap file by `mcap recover`, a .db3 file by `sqlite3 FILE .recover`, and"
+    " the folder's metadata.yaml by `ros2 bag reindex`"
+)
 
 
 class BagSource(Source):
@@ -167,8 +172,8 @@ class BagSource(Source):
             # rosbags passes on what its parts raise (struct, sqlite, YAML, decompressors, assertions):
             # the set is open, and each of them means that the file is not what it should be.
             detail = str(error).strip().rstrip(".").partition("\n")[0] or type(error).__name__
-            mend = "; run `rosbag reindex` on it" if "not indexed" in detail else ""
-            raise SourceError(f"{self._where} is damaged or not a bag: {detail}{mend}") from error
+            fix = _REINDEX if self._wire is Wire.ROS1 else _RECOVER
+            raise SourceError(f"{self._where} is damaged or not a bag: {detail}; {fix}") from error
 
 
 def sample_bag() -> Path:
