@@ -290,7 +290,7 @@ class Site:
             self.folder / "node.log",
             ["chain", "--home", str(self.home.path), "--port", str(self.node_port), "--block-time", "0.2"], {},
         )
-        until("the node answers", lambda: "A local chain answers" in node.said or node.ended())
+        until("the node answers", lambda: "A local chain runs" in node.said or node.ended())
         assert not node.ended(), node.said
 
     def kill_node(self, wait: float) -> None:
