@@ -119,12 +119,12 @@ def user_end(quick: bool) -> Part:
     opening = 2  # lines of the stream that are no messages: what it is from, and the type's definition
     seconds = 1 if quick else 20
     with tempfile.TemporaryDirectory() as folder:
-        _, paced_chunk, _, paced = bridge_costs.throughput(
+        _, paced_chunk, _, (waking, rest) = bridge_costs.throughput(
             who, Path(folder), int(seconds * bridge_costs.PACE), False, pace=bridge_costs.PACE
         )
     return part | {
         "rate": rate, "per_chunk": per_chunk_, "delivered": stored - opening, "on": "no chain",
-        "paced": {"pace": bridge_costs.PACE, "per_chunk": paced_chunk, "ms": paced},
+        "paced": {"pace": bridge_costs.PACE, "per_chunk": paced_chunk, "ms": waking + rest, "waking": waking},
     }  # fmt: skip
 
 

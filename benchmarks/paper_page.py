@@ -303,7 +303,8 @@ Through two processes on loopback, to the server's commit: {across(runs, at("rat
     if "paced" in runs[0]:
         text += f""" **At a robot's real pace**, {runs[0]["paced"]["pace"]:.0f} messages a second,
 {across(runs, at("paced", "per_chunk")).say(number)} to a chunk, the robot takes
-{across(runs, at("paced", "ms")).say(number)} ms of processor a message, its session and all."""
+{across(runs, at("paced", "ms")).say(number)} ms of processor a message, its session and all;
+{across(runs, at("paced", "waking")).say(number)} ms of it wake the thread that the message comes to."""
     return text
 
 

@@ -489,7 +489,7 @@ def test_a_page_that_this_version_did_not_write_is_told(tmp_path: Path, capsys: 
         file.write_text(text, encoding="utf-8")
         assert run(["verify", str(file), "--ca", str(VECTORS / "ca.crt.pem")]) == 0
         said = capsys.readouterr()
-        assert ("The page around it is not as this version writes it" in said.err) == told
+        assert ("The page differs from the one that this version writes" in said.err) == told
         assert len(said.out.splitlines()) == 5 and "What it does not prove:" in said.err
 
 
