@@ -68,8 +68,10 @@ class Town(World):
         reading = read_robot(
             [self.ledger], "robot_1", trust=Trust(roots), reader=reader.encryption_key, now=time.time()
         )  # fmt: skip
-        lines = [line for chunk in reading.chunks for line in chunk.lines if line.startswith(b'{"lost"')]
-        return " ".join(line.decode().split('"')[-2] for line in lines), reading.verdict()
+        list(reading.records())
+        verdict = reading.verdict()
+        said = [found.detail.removeprefix("/t: ") for found in verdict.findings if found.kind is Kind.LOST]
+        return " ".join(said), verdict
 
     def lost(self) -> list[tuple[str, bytes]]:
         """Dead letters: why, and which chunk."""
