@@ -165,10 +165,10 @@ def stage_costs(
         with watch("server: receive and open"):
             for data, _ in sent:
                 server.receive_datagram(data, back, now)
-        with watch("server: verify"):
+        with watch("server: parse"):
             while (event := server.next_event()) is not None:
                 reception.handle(event, now)
-        with watch("server: commit and answer"):
+        with watch("server: verify, commit and answer"):
             reception.turn(now + 1.0, time.time())
             server.handle_timer(now)
             answers = server.datagrams_to_send(now)

@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import geth_network
-from faults import BAD_NETWORK, Count, Flow, Log, Program, Site, family, kill, table, until
+from faults import BAD_NETWORK, Count, Flow, Log, Program, Site, family, kill, running, table, until
 from ports import free_port
 from rosbridge_eth.capture import MessageLine
 from rosbridge_eth.config import load_server_config
@@ -52,24 +52,11 @@ LONG = 600.0  # seconds for what waits for everything
 FAULTS = ["robot", "robot", "shard", "shard", "server", "node", "store"]
 
 
-def neighbouring_ports() -> int:
-    """The first of SHARDS free UDP ports in a row."""
-    while True:
-        first = free_port(socket.SOCK_DGRAM)
-        try:
-            for port in range(first, first + SHARDS):
-                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
-                    trial.bind(("127.0.0.1", port))
-        except OSError:
-            continue
-        return first
-
-
 class CliqueSite(Site):
     """A site of two shards, whose chain is a geth of its own."""
 
     def _set_up(self, redis: bool) -> None:
-        self.udp_port = neighbouring_ports()
+        self.udp_port = free_port(socket.SOCK_DGRAM, SHARDS)
         program, key = geth_network.find_geth("clique"), geth_network.new_key()
         self.geth = geth_network.Node(program, self.folder / "geth", key, {
             "mine": None, "miner.gaslimit": geth_network.GAS_LIMIT, "gcmode": "archive"})
@@ -92,9 +79,6 @@ class CliqueSite(Site):
         if hasattr(self, "geth"):
             self.geth.kill()
 
-    def store(self, shard: int) -> Path:
-        return self.home.store(shard)
-
     def outstanding(self, robot: bytes) -> str:
         with closing(self._store_of(robot)) as store:
             waiting, [state] = store.waiting(robot), store.states([robot])
@@ -116,7 +100,7 @@ class SimFlow(Flow):
     """A robot that publishes the simulation's odometry as it comes, from tick 0 in each of its lives."""
 
     def __init__(self, site: CliqueSite, number: int, rate: float, seed: int) -> None:
-        self._rate, self._duration = rate, ""
+        self._rate = rate
         super().__init__(site, f"robot {number}", seed, harm=BAD_NETWORK if number == 1 else None)
         if self.relay is None:
             self._port = site.udp_port + shard_of(self.robot, SHARDS)
@@ -197,7 +181,7 @@ class Faults:
         assert server is not None
         orphans = family(server.pid)[1:]
         server.kill()
-        until("the children of a dead server end", lambda: not any(Path(f"/proc/{pid}").exists() for pid in orphans))
+        until("the children of a dead server end", lambda: not any(map(running, orphans)))
         self._site.start_server()
 
     def node(self) -> None:
@@ -208,7 +192,7 @@ class Faults:
     def store(self) -> None:
         """The newest copy is put back, and another is made."""
         shard = self._dice.randrange(SHARDS)
-        live = self._site.store(shard)
+        live = self._site.home.store(shard)
         if shard in self._copies:
             copy_of(self._copies[shard], live)
         copy = self._site.folder / f"copy-{shard}.sqlite"
@@ -267,8 +251,8 @@ def main() -> int:
         print(f"{name}: {figure:.0f}")
     total = sum(count.records for count in counts)
     print(f"records: {total}")
-    for count in counts:
-        print(*count.findings, sep="\n")
+    for finding in (finding for count in counts for finding in count.findings):
+        print(finding)
     if options.json:
         options.json.write_text(json.dumps({"robots": [asdict(count) for count in counts], "faults": faults,
                                             "figures": figures}, indent=1) + "\n")
